@@ -1,0 +1,65 @@
+# make demo | test | test-all | bench | check | wheel-test | clean.   Everything is installed into .venv, once.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := -m pip --disable-pip-version-check install -qq --constraint constraints.txt
+PIP := $(BIN)/python $(PIP_INSTALL)
+WORKERS ?= 2
+# One thread per worker: torch's own threads fight over the cores that pytest-xdist already uses.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-slow test-all bench lint types check wheel-test clean
+
+help:
+	@head -1 Makefile
+
+# torch comes first and pinned: asked for by a range, pip would take a newer build with gigabytes of CUDA packages.
+$(VENV)/core.stamp: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) torch==2.13.0
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/dev.stamp: $(VENV)/core.stamp
+	$(PIP) --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/core.stamp
+	$(BIN)/kcam demo --out demo/
+
+test: $(VENV)/dev.stamp
+	$(PYTEST) -m "not slow"
+
+test-slow: $(VENV)/dev.stamp
+	$(PYTEST) -m slow
+
+test-all: $(VENV)/dev.stamp
+	$(PYTEST)
+
+bench: $(VENV)/dev.stamp
+	$(BIN)/python -m benchmarks
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff check .
+
+types: $(VENV)/dev.stamp
+	$(BIN)/mypy
+
+check: lint types test
+
+# The wheel, in an environment of its own and from another folder: tables, py.typed and dependencies are all inside.
+wheel-test: $(VENV)/core.stamp
+	rm -rf .wheel-test && mkdir .wheel-test
+	$(BIN)/python -m pip --disable-pip-version-check wheel -qq --no-deps --wheel-dir .wheel-test/dist .
+	$(PYTHON) -m venv .wheel-test/venv
+	.wheel-test/venv/bin/python $(PIP_INSTALL) torch==2.13.0
+	.wheel-test/venv/bin/python $(PIP_INSTALL) .wheel-test/dist/*.whl
+	cd .wheel-test && venv/bin/python -I -c 'import kcam, pathlib; root = pathlib.Path(kcam.__file__).parent; \
+	    checks = ["site-packages" in str(root), (root / "py.typed").exists(), any(root.glob("tables/*.npz"))]; \
+	    print("wheel:", kcam.__version__, root, checks); raise SystemExit(not all(checks))'
+	cd .wheel-test && venv/bin/kcam --version && venv/bin/kcam psf --camera phone --out psf.png
+	rm -rf .wheel-test
+
+clean:
+	rm -rf $(VENV) .wheel-test build dist demo

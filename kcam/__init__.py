@@ -1,0 +1,9 @@
+"""kcam: a differentiable camera, from the light of a scene to the finished picture, in PyTorch and Kornia."""
+
+from kcam import isp, optics, sensor, units
+from kcam.camera import Camera
+from kcam.context import Context, Stage
+from kcam.scene import Scene
+
+__version__ = "0.1.0"
+__all__ = ["Camera", "Context", "Scene", "Stage", "__version__", "isp", "optics", "sensor", "units"]

@@ -1,0 +1,277 @@
+"""A camera is a sequence of stages, from the light of a scene to the finished picture. No maths is done here."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import os
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcam import files, isp, optics, sensor
+from kcam.context import Context, Stage
+from kcam.scene import Scene
+from kcam.units import mm, nm, um
+
+DEMOSAICING = (isp.Demosaic, isp.LearnedDemosaic)
+ORDER: tuple[type[nn.Module] | tuple[type[nn.Module], ...], ...] = (
+    optics.Imaging,
+    sensor.ColourFilter,
+    sensor.Mosaic,
+    sensor.ADC,
+    DEMOSAICING,
+    isp.WhiteBalance,
+    isp.ColourMatrix,
+    isp.ToneCurve,
+)
+"""Stages that a light path passes once each, in this order. All others may stand anywhere, any number of times."""
+
+
+class Camera(nn.Module):
+    """A sequence of stages; ``camera(scene)`` is the picture.
+
+    What a stage leaves open it takes from its neighbours (pattern, full well, filter, ...) and, at each call, from the
+    scene (wavelengths, illuminant, luminance): both travel in one frozen `Context`. An Imaging stage takes the
+    ColourFilter that follows it into its own computation, with the same result. A plain nn.Module may stand among the
+    stages; it gets the signal alone.
+
+    ``len``, iteration and indexing go over the stages. ``camera[2]`` is a stage; ``camera[:4]`` is a camera that shares
+    these stages and still knows what the others said, so that ``camera[7:](camera[:7](scene))`` is ``camera(scene)``.
+
+    Args:      stages: modules from tensor to tensor, in the order of the light.
+               context: what holds where no stage and no scene says otherwise; by default `Context()`.
+    Raises:    TypeError for a stage that is no module; ValueError if two stages contradict each other, or stand in an
+               order that cannot work.
+    """
+
+    def __init__(self, *stages: nn.Module, context: Context | None = None) -> None:
+        super().__init__()
+        for index, stage in enumerate(stages):
+            if not isinstance(stage, nn.Module):
+                hint = f"Call it: {stage.__name__}(...)." if isinstance(stage, type) else "Wrap it in an nn.Module."
+                raise TypeError(f"stage {index} of the camera is {stage!r}, which is not an nn.Module. {hint}")
+        _check_order(stages)
+        self.stages = nn.ModuleList(stages)
+        self.context = context
+        self.resolve()
+
+    def resolve(self, scene: Scene | Tensor | None = None, *, generator: torch.Generator | None = None) -> Context:
+        """What the stages are told when they see this scene: their neighbours' settings, and the scene's light.
+
+        Raises:    ValueError if two stages contradict each other.
+        """
+        given: dict[str, tuple[Any, str]] = {}
+        for index, stage in enumerate(self.stages):
+            for name, value in stage.provides().items() if isinstance(stage, Stage) else ():
+                here = f"{type(stage).__name__} (stage {index})"
+                other, there = given.setdefault(name, (value, here))
+                if not _same(value, other):
+                    raise ValueError(
+                        f"two stages contradict each other: {there} has {name} = {_short(other)}, {here} has "
+                        f"{name} = {_short(value)}. Give it to one of them only; the other takes it over."
+                    )
+        fields = {name: value for name, (value, _) in given.items()}
+        if isinstance(scene, Scene):
+            fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance")}
+        return dataclasses.replace(self.context or Context(), **fields, generator=generator)
+
+    def forward(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+        """Take a picture.
+
+        Args:      scene: a Scene, or its bands (B,L,H,W) at the context's wavelengths.
+                   generator: source of all noise; None for torch's default one.
+        Returns:   (B,C,H,W), what the last stage gives: sRGB in [0,1] from a camera that ends in ToneCurve.
+        Raises:    TypeError for anything else than a scene or a tensor.
+        """
+        picture: Any = scene.bands() if isinstance(scene, Scene) and not len(self) else scene
+        for _, picture in self.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
+            pass
+        return picture
+
+    def steps(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Iterator[tuple[str, Tensor]]:
+        """Take a picture stage by stage: (name of the stage, its signal), each computed when it is asked for.
+
+        An Imaging that absorbs the filter after it is one step, "Imaging + ColourFilter". Arguments: as `forward`.
+        """
+        if not isinstance(scene, (Scene, Tensor)):
+            raise TypeError(
+                f"a camera takes a Scene or a tensor (B,L,H,W), got {type(scene).__name__}. "
+                "Use Scene.from_rgb(image, depth=2.0) or Scene.from_file(path, depth=2.0)."
+            )
+        context = self.resolve(scene, generator=generator)
+        signal: Any = scene
+        stages = pairwise([*self, None])
+        for stage, successor in stages:
+            name = type(stage).__name__
+            if isinstance(stage, optics.Imaging) and isinstance(successor, sensor.ColourFilter):
+                name = f"{name} + {type(successor).__name__}"
+                signal = stage(signal, context, colour_filter=successor)
+                next(stages)
+            else:
+                if isinstance(signal, Scene) and not isinstance(stage, optics.Imaging):
+                    signal = signal.bands()
+                signal = stage(signal, context) if isinstance(stage, Stage) else stage(signal)
+            yield name, signal
+
+    def raw(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+        """What the sensor recorded: the signal just before the demosaic. Arguments: as `forward`.
+
+        Raises:    ValueError if the camera has no demosaic.
+        """
+        for index, stage in enumerate(self.stages):
+            if isinstance(stage, DEMOSAICING):
+                return self[:index](scene, generator=generator)
+        raise ValueError(
+            "this camera has no isp.Demosaic or LearnedDemosaic, so nothing marks where its raw signal ends. "
+            "Use a slice: camera[:4](scene)."
+        )
+
+    def noiseless(self) -> Camera:
+        """The same camera with every random stage at its mean; it shares the parameters."""
+        return Camera(*(_at_mean(stage) for stage in self), context=self.resolve())
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write weights and a readable configuration into one .safetensors file; see `kcam.files`."""
+        from kcam import __version__
+
+        files.save(self, path, classes=_classes(), version=__version__)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, custom: Sequence[type[nn.Module]] = ()) -> Camera:
+        """Read a camera that `save` wrote; it takes the same pictures, bit for bit.
+
+        Args:      custom: classes of stages that are not kcam's own. No other code is ever run.
+        Raises:    FileNotFoundError, ValueError: see `kcam.files.load`.
+        """
+        camera = files.load(path, classes=_classes(custom))
+        if not isinstance(camera, Camera):
+            raise ValueError(f"{path} holds a {type(camera).__name__}, not a Camera.")
+        return camera
+
+    @staticmethod
+    def thesis() -> Camera:
+        """The thesis's network, layer by layer (its figure 4.1): 28 bands, a DOE to learn, a filter tile to learn.
+
+        A plano-convex lens of N-BK7 (R = 25.8 mm, 5 mm aperture) in focus at 2 m, an 891 x 891 DOE in fused silica,
+        Fresnel PSFs of 297 x 297 pixels, a 28 x 28 tile of twelve Gaussians, and a 3 x 3 convolution to three channels,
+        which plays the demosaic. Before training the DOE is flat and the convolution a local mean, so that the picture
+        is linear, gray and soft.
+        """
+        lens = optics.Lens(
+            optics.CircularAperture(diameter=5 * mm),
+            optics.PlanoConvexLens(radius_of_curvature=25.8 * mm, glass="N-BK7"),
+            optics.DOE(nn.Parameter(torch.zeros(891, 891)), design_wavelength=550 * nm, glass="fused silica"),
+            focus_distance=2.0,
+        )
+        return Camera(
+            optics.Imaging(lens, pixel_pitch=4 * um, propagator="fresnel", psf_shape=(297, 297)),
+            sensor.ColourFilter.learned(tile=28),
+            sensor.Exposure(),
+            isp.Clip(),
+            isp.LearnedDemosaic(),
+            isp.Clip(),
+        )
+
+    @staticmethod
+    def ideal() -> Camera:
+        """A camera without optics, mosaic or noise: three full channels (Nikon 5100), for comparison."""
+        return Camera(
+            sensor.ColourFilter.nikon(),
+            sensor.Exposure(),
+            isp.WhiteBalance(),
+            isp.ColourMatrix(),
+            isp.ToneCurve(),
+        )
+
+    @staticmethod
+    def phone() -> Camera:
+        """A phone's main camera: 4.3 mm f/1.8 in focus at 2 m, 1.4 um pixels in RGGB, 10 bits, and its noise."""
+        lens = optics.Lens(
+            optics.CircularAperture(diameter=4.3 * mm / 1.8),
+            optics.ThinLens(focal_length=4.3 * mm),
+            focus_distance=2.0,
+        )
+        return Camera(
+            optics.Imaging(lens, pixel_pitch=1.4 * um),
+            sensor.ColourFilter.nikon(),
+            sensor.Mosaic("RGGB"),
+            sensor.Exposure(),
+            sensor.ShotNoise(full_well=6_000),
+            sensor.ReadNoise(2.0),
+            sensor.ADC(bits=10, black_level=64),
+            isp.Demosaic(),
+            isp.WhiteBalance(),
+            isp.ColourMatrix(),
+            isp.ToneCurve(),
+        )
+
+    @classmethod
+    def preset(cls, name: str) -> Camera:
+        """A camera by the name of its preset: "thesis", "ideal" or "phone"; see the methods of these names."""
+        if name not in PRESETS:
+            raise ValueError(f"unknown preset {name!r}. There are: {', '.join(PRESETS)}.")
+        return PRESETS[name]()
+
+    def __len__(self) -> int:
+        return len(self.stages)
+
+    def __iter__(self) -> Iterator[nn.Module]:
+        return iter(self.stages)
+
+    def __getitem__(self, key: int | slice) -> Any:
+        if isinstance(key, slice):
+            return Camera(*self.stages[key], context=self.resolve())
+        return self.stages[key]
+
+
+PRESETS: dict[str, Callable[[], Camera]] = {
+    "thesis": Camera.thesis,
+    "ideal": Camera.ideal,
+    "phone": Camera.phone,
+}
+
+
+def _check_order(stages: Sequence[nn.Module]) -> None:
+    last, before = -1, ""
+    for stage in stages:
+        rank = next((rank for rank, cls in enumerate(ORDER) if isinstance(stage, cls)), None)
+        if rank is None:
+            continue
+        name = type(stage).__name__
+        if rank == last:
+            raise ValueError(f"the camera has two {name} stages: light passes one. Remove one of them.")
+        if rank < last:
+            raise ValueError(f"{name} stands after {before}, but light passes it first. Move it before {before}.")
+        last, before = rank, name
+
+
+def _at_mean(stage: Any) -> nn.Module:
+    random = isinstance(stage, Stage) and callable(getattr(stage, "mean", None))
+    return stage.mean() if random else stage
+
+
+def _same(value: Any, other: Any) -> bool:
+    """Equal numbers and strings, equal tensors, the same module."""
+    if isinstance(value, Tensor) or isinstance(other, Tensor):
+        a, b = torch.as_tensor(value).detach(), torch.as_tensor(other).detach()
+        return a.shape == b.shape and bool((a.double().cpu() == b.double().cpu()).all())
+    return value is other or bool(value == other)
+
+
+def _short(value: Any) -> str:
+    text = repr(value.detach().tolist() if isinstance(value, Tensor) and value.numel() == 1 else value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _classes(custom: Sequence[type[nn.Module]] = ()) -> dict[str, type]:
+    """Every class that a saved camera may hold: the public modules of kcam, and those that the caller names."""
+    table: dict[str, type] = {"Camera": Camera, "Context": Context}
+    for module in (optics, sensor, isp):
+        for name, cls in vars(module).items():
+            if inspect.isclass(cls) and issubclass(cls, nn.Module) and cls.__module__.startswith("kcam."):
+                table[f"{module.__name__.removeprefix('kcam.')}.{name}"] = cls
+    return table | {cls.__qualname__: cls for cls in custom}

@@ -1,0 +1,173 @@
+"""The command `kcam`: demo, shoot, psf. The one place where quantities are strings with units."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from kcam import __version__
+
+if TYPE_CHECKING:
+    from kcam.camera import Camera
+
+UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+CameraOption = Annotated[str, typer.Option("--camera", help="thesis, ideal, phone, or a file that Camera.save wrote")]
+
+
+def length(text: str, *, unit: str = "m", name: str = "distance") -> float:
+    """A length in metres from text such as "2", "2 m", "50cm", "550 nm" or "inf".
+
+    Args:      unit: what a bare number is in.
+               name: what to call it in an error.
+    Raises:    ValueError for anything else.
+    """
+    match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)\s*([a-zµ]*)\s*", text.lower())
+    if not match or match[2] not in {"", *UNITS}:
+        raise ValueError(f'{name} "{text}" is not a length: expected e.g. 2, "50 cm" or inf ({", ".join(UNITS)}).')
+    return float(match[1]) * UNITS[match[2] or unit]
+
+
+def lengths(text: str, *, unit: str, name: str) -> list[float]:
+    """Lengths in metres from text such as "1, 2, inf" or "450,550,650 nm": a unit at the end holds for all."""
+    items = [item for item in text.split(",") if item.strip()]
+    last = re.search(r"[a-zµ]+\s*$", items[-1].lower()) if items else None
+    shared = last[0].strip() if last and last[0].strip() in UNITS else unit
+    if not items:
+        raise ValueError(f'{name} "{text}" is empty: expected e.g. "1, 2, inf".')
+    return [length(item, unit=shared, name=name) for item in items]
+
+
+def open_camera(name: str) -> Camera:
+    """A preset by its name, or a saved camera by its path."""
+    from kcam.camera import PRESETS, Camera
+
+    if name in PRESETS:
+        return Camera.preset(name)
+    if Path(name).suffix or Path(name).exists():
+        return Camera.load(name)
+    raise ValueError(f'unknown camera "{name}": expected a preset ({", ".join(PRESETS)}) or a saved .safetensors file.')
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """What the user got wrong is one clear line and exit status 2; what we got wrong stays a traceback."""
+    try:
+        yield
+    except (ValueError, TypeError, OSError) as error:
+        err.print("[bold red]kcam:[/] ", end="")
+        err.print(" ".join(str(error).split()), markup=False)
+        raise typer.Exit(2) from error
+
+
+@contextmanager
+def progress(description: str, *, total: int | None = None) -> Iterator[Callable[[str], None]]:
+    """A bar on the terminal's standard error; gives a function that says what is being done and moves the bar on."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(description, total=total)
+
+        def advance(what: str) -> None:
+            bar.update(task, advance=1, description=f"{description}: {what}")
+
+        yield advance
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"kcam {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version and leave")
+    ] = False,
+) -> None:
+    """A differentiable camera, from the light of a scene to the finished picture."""
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="folder for the pictures")] = Path("demo"),
+    seed: Annotated[int, typer.Option("--seed", help="of the noise")] = 0,
+) -> None:
+    """Photograph the built-in scenes with two cameras; write the pictures, the raws and the PSFs as figures."""
+    with one_line_errors():
+        from kcam import demo as module
+
+        with progress("demo", total=module.STEPS) as advance:
+            paths = module.run(out, seed=seed, advance=advance)
+        for path in paths:
+            typer.echo(path)
+
+
+@app.command()
+def shoot(
+    photo: Annotated[Path, typer.Argument(help="a picture: PNG, JPEG, TIFF, ... of 8 or 16 bits")],
+    camera: CameraOption = "phone",
+    distance: Annotated[str, typer.Option("--distance", help='of the scene: 2, "50 cm", inf')] = "2 m",
+    out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("shot.png"),
+    seed: Annotated[int, typer.Option("--seed", help="of the noise")] = 0,
+) -> None:
+    """Photograph a photograph: what this camera would have seen at that distance. The picture keeps its size."""
+    with one_line_errors():
+        import torch
+
+        from kcam import plots
+        from kcam.scene import Scene
+
+        plots.check_writable(out)
+        stages = open_camera(camera)
+        scene = Scene.from_file(photo, depth=length(distance))
+        generator = torch.Generator().manual_seed(seed)
+        with torch.no_grad(), progress("shoot", total=len(stages)) as advance:
+            for name, picture in stages.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
+                advance(name)
+        if picture.shape[1] != 3:
+            raise ValueError(f"camera {camera} gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
+        plots.write_picture(picture[0], out)
+        typer.echo(out)
+
+
+@app.command()
+def psf(
+    camera: CameraOption = "thesis",
+    out: Annotated[Path, typer.Option("--out", help="the figure to write: .png, .pdf or .svg")] = Path("psf.png"),
+    distances: Annotated[str, typer.Option("--distances", help='of the point: "0.5, 2, inf" [m]')] = "",
+    wavelengths: Annotated[str, typer.Option("--wavelengths", help='of its light: "450, 550, 650" [nm]')] = "",
+) -> None:
+    """Draw a camera's PSFs over wavelength and distance, its MTF, and its encircled energy."""
+    with one_line_errors():
+        import torch
+
+        from kcam import optics, plots
+
+        plots.check_writable(out)
+        imaging = next((stage for stage in open_camera(camera) if isinstance(stage, optics.Imaging)), None)
+        if imaging is None:
+            raise ValueError(f"camera {camera} has no lens, so it has no PSF. Try --camera thesis or phone.")
+        with torch.no_grad(), progress("psf"):
+            figure = plots.psf_figure(
+                imaging,
+                distances=lengths(distances, unit="m", name="distances") if distances else None,
+                wavelengths=lengths(wavelengths, unit="nm", name="wavelengths") if wavelengths else None,
+                title=f"{Path(camera).stem} camera",
+            )
+        plots.save_figure(figure, out)
+        typer.echo(out)
+
+
+def main() -> None:
+    """Entry point of the command `kcam`."""
+    app()

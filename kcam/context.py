@@ -1,0 +1,58 @@
+"""What passes between the stages of a camera beside the picture: one small frozen value.
+
+A stage works alone from its own arguments; what it leaves open (None) it takes from here. A `Camera` fills the fields
+that its stages provide when it is built, and those that the scene provides at each call.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from kcam.units import wavelength_grid
+
+if TYPE_CHECKING:
+    from kcam.optics.lens import Lens
+    from kcam.sensor.colour_filter import ColourFilter
+
+
+@dataclass(frozen=True)
+class Context:
+    """Defaults that a stage falls back on: 28 bands, D65, RGGB, a full well of 10 000 electrons.
+
+    Fields that a scene sets at each call:
+        wavelengths: (L,) float64 [m].
+        illuminant: (L,) relative spectral power of the light on a perfect white, or None for D65.
+        luminance: of a perfect white [cd/m^2].
+        generator: source of all randomness, or None for torch's default one.
+    Fields that stages set when the camera is built:
+        lens, pixel_pitch [m], fill_factor: the optics, for photometry.
+        colour_filter: the filter whose curves white balance, exposure and colour matrix use.
+        pattern: name of the mosaic.
+        full_well [electrons], gain (analogue, 1 at base ISO), white_share (of full scale), black_level (of full scale).
+    """
+
+    wavelengths: Tensor = field(default_factory=wavelength_grid)
+    illuminant: Tensor | None = None
+    luminance: float = 1000.0
+    generator: torch.Generator | None = None
+    lens: Lens | None = None
+    pixel_pitch: float = 4e-6
+    fill_factor: float = 1.0
+    colour_filter: ColourFilter | None = None
+    pattern: str = "RGGB"
+    full_well: float = 10_000.0
+    gain: float = 1.0
+    white_share: float = 0.8
+    black_level: float = 0.0
+
+
+class Stage(nn.Module):
+    """A module from tensor to tensor that may read a `Context`: ``stage(signal)`` or ``stage(signal, context)``."""
+
+    def provides(self) -> dict[str, Any]:
+        """The `Context` fields that this stage determines for its neighbours (arguments left open are left out)."""
+        return {}

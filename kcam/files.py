@@ -1,0 +1,259 @@
+"""Modules in files: weights as safetensors, and a configuration in JSON that a person can read. Nothing is pickled.
+
+The configuration lives in the safetensors metadata. It names each module's class and its constructor arguments, which
+every kcam module stores as attributes of the same name, or gives by a method ``configuration()``; ``cls(**arguments)``
+rebuilds it. Tensors stand in the file under their module path, as in ``state_dict()``. Only classes that the reader's
+table lists are ever built.
+
+    {"class": "sensor.ReadNoise", "arguments": {"sigma_electrons": 3.0, "full_well": null}}
+
+Numbers, strings, true, false and null are themselves; an infinite float is {"float": "inf"}; an array is a tuple; a
+tensor is {"tensor": key, "shape": ...}, a parameter {"parameter": key, "shape": ..., "trainable": ...}; a module that
+occurs again is {"same": path}.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor, nn
+
+from kcam.context import Context
+
+FORMAT = 1
+"""Version of the file format: raised when an older kcam could no longer read what a newer one writes."""
+
+
+def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[str, type], version: str) -> None:
+    """Write a module's weights and configuration, so that `path` always holds either the old file or the whole new one.
+
+    Args:      module: built from the argument types named above.
+               path: the file; replaced if it exists.
+               classes: name in the file -> class. A class that is not listed is written under its own name, and the
+               reader must hand it in.
+               version: of kcam, for the reader's information.
+    Raises:    TypeError for an argument that cannot be written or that its class does not keep;
+               FileNotFoundError if the folder does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot save {path.name}: there is no folder {path.parent}.")
+    writer = _Writer({cls: name for name, cls in classes.items()})
+    configuration = writer.encode(module, path="", owner="")
+    state = module.state_dict(keep_vars=True)
+    aliases = {key: writer.add(tensor, key) for key, tensor in state.items()}
+    document = {
+        "format": FORMAT,
+        "kcam": version,
+        "configuration": configuration,
+        "aliases": {key: stored for key, stored in aliases.items() if key != stored},
+        "state": list(aliases),
+    }
+    tensors = {key: tensor.detach().cpu().clone().contiguous() for key, tensor in writer.tensors.items()}
+    _replace(path, to_bytes(tensors, metadata={"kcam": json.dumps(document, indent=1)}))
+
+
+def load(path: str | os.PathLike[str], *, classes: Mapping[str, type]) -> Any:
+    """Rebuild the module that `save` wrote, on the CPU; the global random state stays as it was.
+
+    Args:      path: the file.
+               classes: name in the file -> class; nothing else is ever built.
+    Raises:    FileNotFoundError; ValueError for a file that is damaged, from elsewhere, from a newer kcam, with a class
+               that `classes` lacks, or with a tensor that is missing or has another shape.
+    """
+    document, tensors = _read(Path(path))
+    reader = _Reader(classes, tensors, path)
+    with torch.random.fork_rng(devices=[]):
+        module = reader.decode(document["configuration"], path="")
+    aliases = document["aliases"]
+    state = {key: reader.tensor(aliases.get(key, key)) for key in document["state"]}
+    try:
+        module.load_state_dict(state)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: the weights do not fit the configuration: {reason}") from error
+    return module
+
+
+def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The configuration in a saved file, as plain values: what was saved, without building it. Raises: as `load`."""
+    return _read(Path(path))[0]
+
+
+class _Writer:
+    """Turns modules into plain values, and collects their tensors."""
+
+    def __init__(self, names: dict[type, str]) -> None:
+        self.names = names
+        self.tensors: dict[str, Tensor] = {}
+        self.seen: dict[int, str] = {}  # id of a tensor or module -> where it stands in the file
+        self.alive: list[Any] = []  # an id is only good while its object lives
+
+    def add(self, tensor: Tensor, key: str) -> str:
+        """Note a tensor; returns the key under which it is stored, which is another one if it is shared."""
+        stored = self.seen.setdefault(id(tensor), key)
+        self.tensors.setdefault(stored, tensor)
+        self.alive.append(tensor)
+        return stored
+
+    def encode(self, value: Any, *, path: str, owner: str) -> Any:
+        if value is None or isinstance(value, (bool, int, str)):
+            return value
+        if isinstance(value, float):
+            return value if math.isfinite(value) else {"float": str(value)}
+        if isinstance(value, (tuple, list)):
+            return [self.encode(item, path=_join(path, index), owner=owner) for index, item in enumerate(value)]
+        if isinstance(value, nn.Parameter):
+            key = self.add(value, path)
+            return {"parameter": key, "shape": list(value.shape), "trainable": value.requires_grad}
+        if isinstance(value, Tensor):
+            return {"tensor": self.add(value, path), "shape": list(value.shape)}
+        if isinstance(value, (nn.Module, Context)):
+            return self.encode_object(value, path=path)
+        raise TypeError(
+            f"cannot save {owner}: a {type(value).__name__} is none of number, string, bool, None, tuple, tensor, "
+            "module. Store what it was made from instead."
+        )
+
+    def encode_object(self, value: Any, *, path: str) -> Any:
+        if id(value) in self.seen:
+            return {"same": self.seen[id(value)]}
+        self.seen[id(value)] = path
+        self.alive.append(value)
+        cls = type(value)
+        arguments = {}
+        for name, argument in _arguments(value).items():
+            owner = f"{cls.__qualname__}({name}=)"
+            arguments[name] = self.encode(argument, path=_join(path, name), owner=owner)
+        return {"class": self.names.get(cls, cls.__qualname__), "arguments": arguments}
+
+
+class _Reader:
+    """Turns plain values and tensors back into modules."""
+
+    def __init__(self, classes: Mapping[str, type], tensors: dict[str, Tensor], file: Any) -> None:
+        self.classes = classes
+        self.tensors = tensors
+        self.file = file
+        self.built: dict[str, Any] = {}  # path or key -> what stands there, so that what was shared stays shared
+
+    def tensor(self, key: str) -> Tensor:
+        if key not in self.tensors:
+            raise ValueError(f"{self.file} lacks the tensor {key!r}: the file is damaged. Save the camera again.")
+        return self.tensors[key]
+
+    def decode(self, value: Any, *, path: str) -> Any:
+        if isinstance(value, list):
+            return tuple(self.decode(item, path=_join(path, index)) for index, item in enumerate(value))
+        if not isinstance(value, dict):
+            return value
+        if "float" in value:
+            return float(value["float"])
+        if "same" in value:
+            return self.built[value["same"]]
+        if "class" in value:
+            self.built[path] = self.build(value["class"], value["arguments"], path=path)
+            return self.built[path]
+        key: str = value["parameter"] if "parameter" in value else value["tensor"]
+        tensor = self.tensor(key)
+        if list(tensor.shape) != value["shape"]:
+            raise ValueError(
+                f"{self.file}: the tensor {key!r} has shape {tuple(tensor.shape)}, but the configuration says "
+                f"{tuple(value['shape'])}: the file is damaged. Save the camera again."
+            )
+        if "parameter" in value and key not in self.built:
+            self.built[key] = nn.Parameter(tensor, requires_grad=value["trainable"])
+        return self.built.get(key, tensor)
+
+    def build(self, name: str, arguments: dict[str, Any], *, path: str) -> Any:
+        if name not in self.classes:
+            raise ValueError(
+                f"{self.file} needs the class {name!r}, which is not one of kcam's. If it is yours, hand it in: "
+                f"Camera.load({str(self.file)!r}, custom=[{name.split('.')[-1]}])."
+            )
+        cls = self.classes[name]
+        values = {key: self.decode(item, path=_join(path, key)) for key, item in arguments.items()}
+        positional: list[Any] = []
+        for key, parameter in _constructor(cls).items():
+            if parameter.kind is parameter.VAR_POSITIONAL:
+                positional.extend(values.pop(key, ()))
+            elif parameter.kind is parameter.POSITIONAL_ONLY and key in values:
+                positional.append(values.pop(key))
+        try:
+            return cls(*positional, **values)
+        except TypeError as error:
+            raise ValueError(f"{self.file}: {name} no longer takes the saved arguments: {error}") from error
+
+
+def _constructor(cls: type) -> dict[str, inspect.Parameter]:
+    """The constructor's parameters."""
+    if cls.__init__ is nn.Module.__init__:  # type: ignore[misc]
+        return {}  # its (*args, **kwargs) only pass through
+    parameters = dict(inspect.signature(cls).parameters)
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        raise TypeError(f"cannot save {cls.__qualname__}: its constructor takes **kwargs. Name its arguments.")
+    return parameters
+
+
+def _arguments(value: Any) -> dict[str, Any]:
+    """The constructor arguments that would build this object again."""
+    if hasattr(value, "configuration"):
+        return value.configuration()
+    arguments = {}
+    for name in _constructor(type(value)):
+        if not hasattr(value, name):
+            raise TypeError(
+                f"cannot save {type(value).__qualname__}({name}=): the module does not keep it. Store every "
+                f"constructor argument as an attribute of the same name: self.{name} = {name}."
+            )
+        argument = getattr(value, name)
+        arguments[name] = tuple(argument) if isinstance(argument, nn.ModuleList) else argument
+    return arguments
+
+
+def _join(path: str, name: str | int) -> str:
+    return f"{path}.{name}" if path else str(name)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The configuration and the tensors in a file; the tensors do not depend on the file any more."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118 (no iterator)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a whole safetensors file ({error}): it is damaged, or no camera.") from error
+    if "kcam" not in metadata:
+        raise ValueError(f"{path} holds weights but no camera: it was not written by Camera.save.")
+    document = json.loads(metadata["kcam"])
+    if document["format"] > FORMAT:
+        raise ValueError(
+            f"{path} was written by kcam {document['kcam']} in format {document['format']}; this kcam reads up to "
+            f"format {FORMAT}. Update kcam."
+        )
+    return document, tensors
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write beside the file, then take its place: a crash or a full disk leaves the old file whole."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

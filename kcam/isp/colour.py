@@ -1,0 +1,214 @@
+"""From demosaiced camera signals to sRGB: white balance, colour matrix, tone curve."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from kornia.color import linear_rgb_to_rgb
+from torch import Tensor
+
+from kcam import spectral
+from kcam.context import Context, Stage
+from kcam.sensor.colour_filter import ColourFilter
+from kcam.sensor.noise import hold, in_float32, like
+from kcam.ste import clip_ste
+
+LEAST_WHITE = 1e-6
+NOISE = 0.003
+
+
+@functools.cache
+def _default_filter(channels: int) -> ColourFilter:
+    kodak = ColourFilter.kodak()
+    if channels == 1:
+        return ColourFilter(kodak.coefficients[1:2], width=kodak.width)
+    return ColourFilter.rgbw() if channels == 4 else kodak
+
+
+def _filter_of(context: Context, channels: int) -> ColourFilter:
+    """The context's filter, or the default one; ValueError unless it has one curve per channel of the signal."""
+    colour_filter = context.colour_filter or _default_filter(channels)
+    curves = len(colour_filter.response(context.wavelengths))
+    if curves != channels:
+        raise ValueError(
+            f"the signal has {channels} channels and the colour filter {curves} curves, so neither white balance gains "
+            f"nor a colour matrix follow from the filter. Give gains=torch.ones({channels}) to Demosaic and "
+            f"WhiteBalance, and matrix=torch.eye(3, {channels}) to ColourMatrix. A mosaic needs a Demosaic first."
+        )
+    return colour_filter
+
+
+def _channels(signal: Tensor) -> int:
+    if signal.ndim < 3:
+        raise ValueError(f"expected a picture (..., C, H, W), got shape {tuple(signal.shape)}.")
+    return signal.shape[-3]
+
+
+def as_shot_gains(context: Context, *, channels: int = 3) -> Tensor:
+    """White balance gains of the light that the picture was taken in: what makes a perfect white gray.
+
+    g_c = white_green / white_c,   white_c = sum_l kappa_c(lambda_l) E(lambda_l) width_l
+
+    Args:      context: its colour_filter, wavelengths and illuminant; by default the Kodak curves (with white for 4
+               channels, green alone for 1) and D65.  channels: C of the signal.
+    Returns:   (C,) float64, 1 in green (channel 1, or the only one); differentiable in the filter.
+    Raises:    ValueError if the filter has not one curve per channel.
+    """
+    colour_filter = _filter_of(context, channels)
+    white = colour_filter.white(context.wavelengths, illuminant=context.illuminant).clamp(min=LEAST_WHITE)
+    return white[min(1, channels - 1)] / white
+
+
+@in_float32
+def white_balance(signal: Tensor, *, gains: Tensor) -> Tensor:
+    """Multiply each channel of (..., C, H, W) by its gain, (C,)."""
+    channels = _channels(signal)
+    if gains.shape != (channels,):
+        raise ValueError(
+            f"gains of shape {tuple(gains.shape)} do not fit a signal of {channels} channels: expected ({channels},), "
+            "one gain per channel."
+        )
+    return signal * gains.to(signal)[:, None, None]
+
+
+class WhiteBalance(Stage):
+    """White balance: one gain per channel, `white_balance`.
+
+    Args:      gains: (C,); an nn.Parameter trains. None for `as_shot_gains`: the light of the scene, as the colour
+               filter sees it.
+    """
+
+    gains: Tensor | None
+
+    def __init__(self, gains: Tensor | None = None):
+        super().__init__()
+        hold(self, gains=gains)
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,C,H,W) to the same shape."""
+        gains = self.gains
+        if gains is None:
+            gains = as_shot_gains(context or Context(), channels=_channels(signal))
+        return white_balance(signal, gains=gains)
+
+
+@functools.cache
+def _chart_in_linear_srgb() -> list[list[float]]:
+    """The 24 patches of the colour chart under D65, as the observer sees them: (24,3), not clipped."""
+    _, wavelengths, reflectances = spectral.colour_chart()
+    colours = reflectances @ spectral.xyz_weights(wavelengths, "D65") @ spectral.xyz_to_srgb_matrix().T
+    return colours.tolist()
+
+
+def fit_colour_matrix(signals: Tensor, *, colours: Tensor, noise: float = NOISE) -> Tensor:
+    """The matrix that takes camera signals closest to colours and leaves white white.
+
+    minimise over M:   sum_k |M s_k - t_k|^2 / K + noise^2 |M|^2    with   M (1,..,1)^T = (1,1,1)^T
+
+    The second term is the noise that the matrix would pass on; it also decides where the signals leave M open.
+
+    Args:      signals: (K,C), white balanced, a perfect white = 1.  colours: (K,3) linear sRGB.
+               noise: RMS noise of the signals to guard against, > 0.
+    Returns:   (3,C) in the dtype of the signals; differentiable.
+    """
+    count, channels = signals.shape
+    identity = torch.eye(channels, dtype=signals.dtype, device=signals.device)
+    inverse = torch.linalg.inv(signals.T @ signals / count + noise**2 * identity)
+    free = colours.T @ signals / count @ inverse
+    to_white = inverse.sum(0) / inverse.sum()
+    return free + (1 - free.sum(1, keepdim=True)) * to_white
+
+
+def as_shot_colour_matrix(context: Context, *, channels: int = 3) -> Tensor:
+    """The colour matrix of this filter in this light, fitted to the 24 patches of the colour chart.
+
+    The patches are taken by the filter under the scene's light, white balanced, and fitted to their colours under D65
+    (the colour of a surface is what it is in daylight, so no model of chromatic adaptation is needed).
+
+    Args:      context: as for `as_shot_gains`, and white_share.  channels: C of the signal.
+    Returns:   (3,C) float64: an exposed (white_share), balanced signal to linear sRGB, a perfect white to (1,1,1);
+               differentiable in the filter.
+    Raises:    ValueError if the filter has not one curve per channel.
+    """
+    wavelengths = context.wavelengths
+    weights = _filter_of(context, channels).contraction(wavelengths)
+    light = context.illuminant
+    if light is None:
+        light = spectral.illuminant("D65", wavelengths=wavelengths)
+    light = light.to(weights)
+    patches = spectral.reflectances(wavelengths).to(weights) * light
+    white = (weights @ light).clamp(min=LEAST_WHITE)
+    signals = (patches @ weights.T) / white
+    colours = torch.tensor(_chart_in_linear_srgb(), dtype=weights.dtype, device=weights.device)
+    return fit_colour_matrix(signals, colours=colours) / like(context.white_share, signals)
+
+
+@in_float32
+def apply_colour_matrix(signal: Tensor, *, matrix: Tensor) -> Tensor:
+    """(..., C, H, W) to (..., N, H, W) by a matrix (N,C) on the channels of each pixel."""
+    channels = _channels(signal)
+    if matrix.ndim != 2 or matrix.shape[1] != channels:
+        raise ValueError(
+            f"a matrix of shape {tuple(matrix.shape)} does not fit a signal of {channels} channels: expected "
+            f"(3, {channels}), rows for red, green, blue."
+        )
+    return torch.einsum("nc,...chw->...nhw", matrix.to(signal), signal)
+
+
+class ColourMatrix(Stage):
+    """Camera colours to linear sRGB, a perfect white to 1.0: `apply_colour_matrix`.
+
+    Args:      matrix: (3,C); an nn.Parameter trains. None for `as_shot_colour_matrix`, fitted for the context's filter
+               and light. It counts on a white balanced signal. A signal of one channel becomes gray.
+    """
+
+    matrix: Tensor | None
+
+    def __init__(self, matrix: Tensor | None = None):
+        super().__init__()
+        hold(self, matrix=matrix)
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,C,H,W) to (B,3,H,W)."""
+        matrix = self.matrix
+        if matrix is None:
+            matrix = as_shot_colour_matrix(context or Context(), channels=_channels(signal))
+        return apply_colour_matrix(signal, matrix=matrix)
+
+
+def tone_curve(signal: Tensor) -> Tensor:
+    """Linear sRGB to coded sRGB: clipped to 0..1, then the sRGB transfer function of IEC 61966-2-1.
+
+    v = 12.92 x                  x <= 0.0031308
+    v = 1.055 x^(1/2.4) - 0.055  above
+
+    Args:      signal: (..., 3, H, W), or one channel of gray.
+    Returns:   same shape, in [0,1]. The gradient is finite everywhere; beyond the clip it is that of `clip_ste`.
+    Raises:    ValueError for another number of channels.
+    """
+    channels = _channels(signal)
+    if channels not in (1, 3):
+        raise ValueError(
+            f"the sRGB curve takes 3 channels, or 1 of gray, got {channels}. Put a ColourMatrix before it."
+        )
+    clipped = clip_ste(signal, 0.0, 1.0)
+    if channels == 3:
+        return linear_rgb_to_rgb(clipped)
+    return linear_rgb_to_rgb(clipped.expand(*signal.shape[:-3], 3, -1, -1))[..., :1, :, :]
+
+
+class ToneCurve(Stage):
+    """The sRGB curve: `tone_curve`."""
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,C,H,W) linear sRGB to coded sRGB in [0,1]."""
+        return tone_curve(signal)
+
+
+class Clip(Stage):
+    """Clip to 0..1 with the gradient of `clip_ste`, as between the layers of the thesis's network."""
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """Any shape."""
+        return clip_ste(signal, 0.0, 1.0)

@@ -1,0 +1,334 @@
+"""A lens: thin elements in one pupil plane, at a distance from the sensor."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from kcam.optics import sampling
+from kcam.optics.elements import Aperture, Element, Scalar, float64, set_scalar
+from kcam.optics.propagation import choose
+from kcam.optics.psf import Query
+from kcam.optics.pupil import disc_weights, unfold_quadrant
+from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
+
+
+class Lens(nn.Module):
+    """Thin elements whose optical paths add in one pupil plane, in front of a sensor.
+
+    Args:
+        elements: the parts of the lens; exactly one is an aperture.
+        focus_distance: sets the sensor where the lens focuses an object at this distance [m], inf allowed; paraxially, at
+            `focus_wavelength`, once: training the elements later does not move the sensor.
+        sensor_distance: pupil to sensor [m], instead; may be a Parameter.
+        focus_wavelength: [m].
+    Raises:
+        ValueError for no or two apertures, both or neither distance, a focus inside the focal length, r >= R.
+        TypeError for something that is no element.
+    """
+
+    def __init__(
+        self,
+        *elements: Element,
+        focus_distance: float | None = None,
+        sensor_distance: Scalar | None = None,
+        focus_wavelength: float = 550e-9,
+    ) -> None:
+        super().__init__()
+        for element in elements:
+            if not isinstance(element, Element):
+                raise TypeError(f"a lens takes elements such as CircularAperture or DOE, got {type(element).__name__}.")
+        apertures = [element for element in elements if isinstance(element, Aperture)]
+        if len(apertures) != 1:
+            raise ValueError(
+                f"a lens has exactly one aperture, got {len(apertures)}; add CircularAperture(diameter=5 * mm) or remove "
+                "all but one."
+            )
+        if (focus_distance is None) == (sensor_distance is None):
+            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
+        self.elements = nn.ModuleList(elements)
+        self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
+        if focus_distance is not None:
+            sensor_distance = self._sensor_distance_for(float(check_distances(focus_distance, name="focus_distance")))
+        check_positive(sensor_distance, name="sensor_distance")
+        set_scalar(self, "sensor_distance", sensor_distance)
+        self._check_curvature()
+
+    def configuration(self) -> dict[str, object]:
+        """Constructor arguments, for saving: the sensor's distance, which was set once, rather than the focus."""
+        return {
+            "elements": list(self.elements),
+            "sensor_distance": self.sensor_distance,
+            "focus_wavelength": self.focus_wavelength,
+        }
+
+    @property
+    def aperture(self) -> Aperture:
+        """The element that bounds the pupil."""
+        return next(element for element in self.elements if isinstance(element, Aperture))
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether every element is rotationally symmetric by its type."""
+        return all(element.symmetric for element in self.elements)
+
+    @property
+    def round(self) -> bool:
+        """Whether the rim of the aperture is a circle."""
+        return bool(self.aperture.discs())
+
+    @property
+    def has_pixel_phase(self) -> bool:
+        """Whether an element has its phase on flat pixels, which has no slope."""
+        grid = wavelength_grid([self.focus_wavelength])
+        return any(
+            pixels.factors is not None for pixels in (e.pixel_map(grid) for e in self.elements) if pixels is not None
+        )
+
+    def pixel_phase_displacement(self, query: Query) -> float:
+        """How far pixel phase maps send all but a thousandth of their light on the sensor [m], at most their Nyquist angle."""
+        total = 0.0
+        for element in self.elements:
+            pixels = element.pixel_map(query.wavelengths)
+            if pixels is None or pixels.factors is None or pixels.values.shape[-1] < 2:
+                continue
+            half_width = query.semi_aperture.detach() if pixels.half_width is None else pixels.half_width
+            pitch = 2 * float(half_width) / pixels.values.shape[-1]
+            phase = pixels.values.detach().to(torch.float64) * float(pixels.factors.max())
+            steps = torch.cat([phase.diff(dim=0).flatten(), phase.diff(dim=1).flatten()])
+            wrapped = torch.remainder(steps + torch.pi, 2 * torch.pi) - torch.pi
+            slope = float(wrapped.abs().kthvalue(math.ceil(0.999 * wrapped.numel())).values) / (2 * torch.pi * pitch)
+            total += slope * float(query.wavelengths.max()) * float(query.sensor_distance.detach())
+        return total
+
+    def psf(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        propagator: str = "nonparaxial",
+        method: str | None = None,
+        samples: int | None = None,
+        fill_factor: float = 1.0,
+        integrate: bool = True,
+        dtype: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """Energy of a point source's image in each pixel, relative to the light that passes the aperture.
+
+        Args:
+            wavelengths: (L,) [m]. distances: object distances, a number or (Z,) [m], inf allowed.
+            pixel_pitch: [m]. shape: (H, W) of the window in pixels; index n // 2 is the origin.
+            propagator: the physics: nonparaxial, fresnel, angular_spectrum, geometric, reference.
+            method: the transform: matrix, chirp_z, fft, radial; None: the cheapest that is exact for this lens.
+            samples: across the pupil; None: by the rule of `sampling.pupil_samples`.
+            fill_factor: light-sensitive share of a pixel; the PSF is averaged over that square in its centre.
+            integrate: over the pixels; False: the irradiance at their centres times the pixel's area.
+            dtype: of the result, float32 or float64.
+        Returns:   (Z, L, H, W), >= 0 up to the sampling error; sums to the share of light in the window.
+        Raises:    ValueError for lengths that are not in metres, distances <= 0, an unknown propagator or method, a shape
+                   that is not two positive integers, or a pupil too coarse for the window (with the sampling that would do).
+        Valid on the axis, for thin elements and scalar light; the model's own error is `propagation.choose(...).error`.
+        """
+        query = self.query(
+            wavelengths,
+            distances=distances,
+            pixel_pitch=pixel_pitch,
+            shape=shape,
+            samples=samples,
+            fill_factor=fill_factor,
+            integrate=integrate,
+            dtype=dtype,
+        )
+        return choose(query, propagator=propagator, method=method)(query)
+
+    def query(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        samples: int | None = None,
+        fill_factor: float = 1.0,
+        integrate: bool = True,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | None = None,
+    ) -> Query:
+        """The arguments of `psf`, checked, as one value."""
+        if len(shape) != 2 or any(not isinstance(n, int) or n < 1 for n in shape):
+            raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.")
+        if not 0 < fill_factor <= 1:
+            raise ValueError(f"fill_factor {fill_factor:g} must be in (0, 1]: the light-sensitive share of a pixel.")
+        if samples is not None and (not isinstance(samples, int) or samples < 32):
+            raise ValueError(f"samples must be an integer >= 32 across the pupil, or None, got {samples!r}.")
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}; cast the result instead.")
+        if device is None:
+            device = next((t.device for t in (*self.parameters(), *self.buffers())), torch.device("cpu"))
+        grid = check_distances(distances).to(device)
+        if grid.ndim > 1:
+            raise ValueError(f"distances must be a number or a vector (Z,), got shape {tuple(grid.shape)}.")
+        self._check_curvature()
+        return Query(
+            lens=self,
+            wavelengths=wavelength_grid(wavelengths),
+            vergences=1 / grid.reshape(-1),
+            pixel_pitch=check_pixel_pitch(pixel_pitch),
+            shape=(int(shape[0]), int(shape[1])),
+            dtype=dtype,
+            device=device,
+            integrate=integrate,
+            active=math.sqrt(fill_factor),
+            samples=samples,
+        )
+
+    def mtf(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        propagator: str = "nonparaxial",
+        method: str | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """Modulation transfer function, |OTF| / OTF(0), with the pixel's own sinc in it.
+
+        Returns: (Z, L, H, W) in [0, 1]; index n // 2 is frequency 0, the step is 1 / (n * pixel_pitch) cycles per metre.
+        """
+        psf = self.psf(
+            wavelengths,
+            distances=distances,
+            pixel_pitch=pixel_pitch,
+            shape=shape,
+            propagator=propagator,
+            method=method,
+            dtype=dtype,
+        )
+        otf = torch.fft.fftshift(torch.fft.fft2(psf), dim=(-2, -1))
+        # sqrt(re^2 + im^2) with a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
+        magnitude = torch.sqrt(otf.real.square() + otf.imag.square() + torch.finfo(dtype).tiny)
+        return magnitude / psf.sum((-2, -1), keepdim=True)
+
+    def encircled_energy(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        propagator: str = "nonparaxial",
+        method: str | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """Share of the light through the aperture that falls within a circle around the origin.
+
+        The irradiance is evaluated between the pixels, at a quarter of its Nyquist pitch, and summed with the edge weights
+        of a disc: no pixel counts as a whole.
+
+        Returns: (Z, L, K + 1) for radii k * pixel_pitch, k = 0..K = min(H, W) // 2, rising from 0.
+        """
+        largest = min(shape) // 2
+        curves = []
+        for wavelength in wavelength_grid(wavelengths).tolist():
+            fine = 3 * math.ceil(
+                sampling.points_per_pixel(
+                    pixel_pitch=pixel_pitch,
+                    semi_aperture=float(self.aperture.semi_aperture().detach()),
+                    sensor_distance=float(float64(self.sensor_distance).detach()),
+                    wavelength=wavelength,
+                )
+            )
+            side = 2 * (largest * fine + 8) + 2  # even: the disc's weights sit between the points of an even grid
+            points = self.psf(
+                [wavelength],
+                distances=distances,
+                pixel_pitch=check_pixel_pitch(pixel_pitch) / fine,
+                shape=(side + 1, side + 1),
+                propagator=propagator,
+                method=method,
+                integrate=False,
+                dtype=dtype,
+            )[:, 0]
+            curves.append(torch.stack([_disc_sum(points, k * fine) for k in range(largest + 1)], dim=-1))
+        return torch.stack(curves, dim=1)
+
+    def power(self, wavelengths: Tensor) -> Tensor:
+        """Paraxial power at each wavelength, (L,) float64 [1/m]."""
+        return -sum(element.vergence(wavelengths) for element in self.elements)
+
+    def focal_length(self, wavelength: float | Tensor = 550e-9) -> float | Tensor:
+        """Paraxial focal length [m]: a float for a float, (L,) float64 for wavelengths (L,); inf without power."""
+        grid = wavelength_grid(wavelength if isinstance(wavelength, Tensor) else [wavelength])
+        focal = 1 / self.power(grid).detach()
+        return focal if isinstance(wavelength, Tensor) and wavelength.ndim else float(focal[0])
+
+    @property
+    def focus_distance(self) -> float:
+        """Object distance that is imaged onto the sensor paraxially at `focus_wavelength` [m]; inf, or < 0 if virtual."""
+        vergence = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0]) - 1 / float(
+            float64(self.sensor_distance).detach()
+        )
+        # below 1e-9 1/m nothing tells the distance from infinity: 1e-14 waves in a 5 mm aperture
+        return math.inf if abs(vergence) < 1e-9 else 1 / vergence
+
+    @property
+    def f_number(self) -> float:
+        """Working f-number: sensor distance over the width of the aperture."""
+        return float(float64(self.sensor_distance).detach() / (2 * self.aperture.semi_aperture().detach()))
+
+    def aperture_area(self) -> float:
+        """Open area of the aperture [m^2]."""
+        side = 2 * float(self.aperture.semi_aperture().detach())
+        return side**2 * float(torch.as_tensor(self.aperture.open_share()).detach())
+
+    def _sensor_distance_for(self, focus_distance: float) -> float:
+        power = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0])
+        if power <= 0:
+            raise ValueError(
+                f"this lens has a power of {power:g} 1/m at {self.focus_wavelength * 1e9:.4g} nm and cannot focus: add a "
+                "ThinLens or a PlanoConvexLens, or give sensor_distance=."
+            )
+        image_vergence = power - 1 / focus_distance
+        if image_vergence <= 0:
+            raise ValueError(
+                f"focus_distance {focus_distance:g} m is inside the focal length {1 / power:g} m: no real image. "
+                f"Focus beyond {1 / power:g} m."
+            )
+        return 1 / image_vergence
+
+    def _check_curvature(self) -> None:
+        semi = float(self.aperture.semi_aperture().detach())
+        for element in self.elements:
+            radius = getattr(element, "radius_of_curvature", None)
+            if radius is not None and semi >= float(float64(radius).detach()):
+                raise ValueError(
+                    f"the aperture reaches r = {semi:g} m, but the surface ends at its radius of curvature "
+                    f"R = {float(radius):g} m (r >= R). Use a diameter below {2 * float(radius):g} m or a larger R."
+                )
+
+
+def _disc_sum(image: Tensor, radius: int) -> Tensor:
+    """Integral over a disc around the centre of an odd image (..., 2K+1, 2K+1), radius in samples; (...)."""
+    if radius == 0:
+        return image.sum((-2, -1)) * 0
+    half = radius + 8
+    centre = image.shape[-1] // 2
+    weights = unfold_quadrant(disc_weights(2 * half, spacing=1.0, radius=float(radius))).to(image)
+    # the weights' nodes lie half-way between the image's points: shift by half a sample in the frequency domain
+    window = image[..., centre - half : centre + half, centre - half : centre + half]
+    return (window * _half_shifted(weights)).sum((-2, -1))
+
+
+def _half_shifted(weights: Tensor) -> Tensor:
+    """The weights at integer positions instead of half-integer ones, by their band-limited interpolation."""
+    n = weights.shape[-1]
+    frequency = torch.fft.fftfreq(n, device=weights.device, dtype=torch.float64)
+    turn = torch.complex((torch.pi * frequency).cos(), -(torch.pi * frequency).sin())
+    spectrum = torch.fft.fft2(weights.to(torch.float64)) * turn[:, None] * turn
+    return torch.fft.ifft2(spectrum).real.to(weights)

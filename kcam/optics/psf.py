@@ -1,0 +1,415 @@
+"""Point spread functions: from the elements of a lens to the energy in each pixel.
+
+    h(x, y) = |U|^2,  U(x) = 1 / (lambda d sqrt(E)) INT A exp(i k W) exp(-i k x.u' / d) d^2 u'
+
+W is the *residual* optical path: source, lens and propagation are each thousands of radians and cancel in focus, so
+their vergences are summed as float64 scalars first. E is the energy that passes the aperture: a PSF sums to the share of
+that light which falls into its window, and is not normalised to 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from kcam.optics import sampling
+from kcam.optics.pupil import (
+    MapWeights,
+    Pupil,
+    disc_coverage,
+    disc_weights,
+    from_image_side,
+    grid_nodes,
+    grid_spacing,
+    map_weights,
+    pupil_tau,
+    unfold_quadrant,
+)
+from kcam.optics.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Pair, fast_length, pupil_intensity
+
+if TYPE_CHECKING:
+    from kcam.optics.lens import Lens
+
+_BLOCK_PHASE = 0.03  # radians; 0.1 costs 2e-3 of the PSF, 0.02 1e-4
+_MAX_BLOCKS = 128
+_CELLS_PER_SAMPLE = 1.7  # of a pixel map for each pupil sample, so that the area of a cut cell is area enough
+
+
+@dataclass(frozen=True)
+class Query:
+    """What is asked of a propagator: a lens, where the light comes from, and which pixels to fill.
+
+    wavelengths: (L,) float64 [m]; vergences: (Z,) float64 [1/m], 0 for infinity, may carry gradients.
+    pixel_pitch [m]; shape: (H, W) pixels; integrate: over pixels (else point samples times the pixel's area).
+    active: width of the light-sensitive part of a pixel (square root of the fill factor).
+    samples: across the pupil, or None for the rule of `sampling.pupil_samples` with `kappa`.
+    """
+
+    lens: Lens
+    wavelengths: Tensor
+    vergences: Tensor
+    pixel_pitch: float
+    shape: tuple[int, int]
+    dtype: torch.dtype
+    device: torch.device
+    paraxial: bool = False
+    integrate: bool = True
+    active: float = 1.0
+    kappa: float = sampling.KAPPA
+    samples: int | None = None
+
+    @property
+    def semi_aperture(self) -> Tensor:
+        """a [m], 0-d float64."""
+        return self.lens.aperture.semi_aperture().to(self.device)
+
+    @property
+    def sensor_distance(self) -> Tensor:
+        """d [m], 0-d float64."""
+        return torch.as_tensor(self.lens.sensor_distance, dtype=torch.float64, device=self.device)
+
+    @property
+    def tau(self) -> Tensor:
+        """(a / d)^2, 0 where paraxial."""
+        return pupil_tau(self.semi_aperture, self.sensor_distance, paraxial=self.paraxial)
+
+    @property
+    def image_side_semi_aperture(self) -> Tensor:
+        """a' = a / sqrt(1 + tau) [m]."""
+        return self.semi_aperture / torch.sqrt(1 + self.tau)
+
+    @property
+    def half_window(self) -> float:
+        """From the origin to the edge of what is evaluated [m]."""
+        return self.half_pixels * self.pixel_pitch
+
+    @property
+    def half_pixels(self) -> int:
+        """Pixels from the origin to the edge of what is evaluated."""
+        return max(self.shape) // 2 + (sampling.WINDOW_MARGIN if self.integrate else 0)
+
+    def evaluation_grid(self, wavelength: float) -> tuple[float, int]:
+        """(points per pixel, points from the origin to the edge) at which the intensity of a wavelength is evaluated."""
+        per_pixel = 1.0
+        if self.integrate:
+            per_pixel = sampling.points_per_pixel(
+                pixel_pitch=self.pixel_pitch,
+                semi_aperture=float(self.image_side_semi_aperture.detach()),
+                sensor_distance=float(self.sensor_distance.detach()),
+                wavelength=wavelength,
+            )
+        return per_pixel, math.ceil(per_pixel * self.half_pixels)
+
+    def pupil(self, x: Tensor, y: Tensor) -> Pupil:
+        """The pupil at true normalised coordinates."""
+        return Pupil(x, y, self.semi_aperture, self.sensor_distance, self.paraxial)
+
+
+# ---- the residual optical path -----------------------------------------------------------------------------------
+
+
+def residual_vergence(query: Query) -> Tensor:
+    """V = 1/z + 1/d + sum of the elements' vergences, (L, Z) float64 [1/m]; 0 in focus."""
+    lens = sum(element.vergence(query.wavelengths.to(query.device)) for element in query.lens.elements)
+    return (lens + 1 / query.sensor_distance)[:, None] + query.vergences[None, :]
+
+
+def residual_path(query: Query, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    """The residual OPD as (coefficients (L, Z, T), maps (T, ...)), W = coefficients . maps, both float64.
+
+    The first map is rho^2 with V a^2 / 2; then what the image-side and the object-side sphere have beyond their parabolas,
+    then the elements' own terms. Pixel maps are not part of it.
+    """
+    wavelengths = query.wavelengths.to(query.device)
+    bands, distances = wavelengths.numel(), query.vergences.numel()
+    ones = wavelengths.new_ones(bands, distances)
+    coefficients = [residual_vergence(query) * query.semi_aperture**2 / 2]
+    maps = [pupil.rho2]
+    if not query.paraxial:
+        coefficients.append(ones)
+        maps.append(pupil.beyond_paraxial(1 / query.sensor_distance))
+        for index, vergence in enumerate(query.vergences):
+            if vergence.requires_grad or float(vergence) != 0:
+                coefficients.append(ones * (torch.arange(distances, device=query.device) == index))
+                maps.append(pupil.beyond_paraxial(vergence))
+    for element in query.lens.elements:
+        for coefficient, term in element.terms(pupil, wavelengths):
+            coefficients.append(coefficient[:, None] * ones)
+            maps.append(term)
+    shape = torch.broadcast_shapes(*(m.shape for m in maps))
+    return torch.stack(coefficients, dim=-1), torch.stack([m.expand(shape) for m in maps])
+
+
+def ray_displacement(query: Query) -> Tensor:
+    """How far the smooth part of the pupil sends its rays on the sensor, max d |grad W|, (L,) float64 [m]."""
+    with torch.no_grad():
+        extremes = query.vergences.detach()
+        if extremes.numel() > 2:
+            extremes = torch.stack([extremes.min(), extremes.max()])  # |grad W| is convex in the vergence
+        side = torch.linspace(-1, 1, 97, dtype=torch.float64, device=query.device)
+        if query.lens.symmetric:
+            side = side[48:]
+            x, y = side, torch.zeros_like(side)
+        else:
+            x, y = side[None, :], side[:, None]
+        coarse = _replace_vergences(query, extremes)
+        coefficients, maps = residual_path(coarse, query.pupil(x, y))
+        inside = (query.pupil(x, y).rho2 <= 1.0001) | (not query.lens.round)
+        step = float(side[1] - side[0]) * float(query.semi_aperture)
+        gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
+        slope2 = sum((coefficients.flatten(0, 1) @ g.flatten(1)) ** 2 for g in gradients)
+        slope2 = torch.where(inside.flatten(), slope2, slope2.new_zeros(()))
+        slope = slope2.amax(dim=1).sqrt().view(query.wavelengths.numel(), -1).amax(dim=1)
+        return (slope * query.sensor_distance).cpu()
+
+
+def _replace_vergences(query: Query, vergences: Tensor) -> Query:
+    return replace(query, vergences=vergences)
+
+
+def aperture_energy(query: Query) -> Tensor:
+    """E: light through the aperture relative to its bounding square's area times the on-axis irradiance, (Z,) float64.
+
+    Only used by propagators that do not sum it on their own grid.
+    """
+    return torch.as_tensor(query.lens.aperture.open_share(), dtype=torch.float64) * torch.ones_like(query.vergences)
+
+
+# ---- propagation on a Cartesian pupil grid -----------------------------------------------------------------------
+
+
+def grid_psf(query: Query, *, method: str) -> Tensor:
+    """PSFs by a transform of a Cartesian pupil grid: `matrix`, `chirp_z` or `fft`; (Z, L, H, W)."""
+    displacement = ray_displacement(query)
+    bands: list[Tensor] = [torch.empty(0)] * query.wavelengths.numel()
+    for members, count, per_pixel in _groups(query, displacement, method=method):
+        images = _grid_group(query, members, count=count, per_pixel=per_pixel, method=method, displacement=displacement)
+        for index, image in zip(members, images.unbind(0), strict=True):
+            bands[index] = image
+    return torch.stack(bands, dim=1)
+
+
+def grid_samples(query: Query, *, displacement: Tensor, wavelength: float, index: int) -> int:
+    """Pupil samples for one wavelength: the rule's, or the user's after a check that no replica enters the window.
+
+    Raises: ValueError with the sampling that would do.
+    """
+    geometry = {
+        "semi_aperture": float(query.image_side_semi_aperture.detach()),
+        "sensor_distance": float(query.sensor_distance.detach()),
+        "wavelength": wavelength,
+        "half_window": query.half_window,
+        "displacement": float(displacement[index]),
+    }
+    needed = sampling.pupil_samples(**geometry, kappa=query.kappa)
+    if query.lens.has_pixel_phase:
+        needed = 64 * math.ceil(needed / 64)  # few distinct grids: each needs weights of its own for the map
+    if query.samples is None:
+        if needed > sampling.MAX_PUPIL_SAMPLES:
+            raise ValueError(
+                f"this PSF needs {needed} pupil samples at {wavelength * 1e9:.4g} nm (blur "
+                f"{geometry['displacement'] * 1e3:.3g} mm, window {2 * query.half_window * 1e3:.3g} mm), more than "
+                f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape, method='radial', or propagator='geometric'."
+            )
+        return needed
+    if sampling.kappa_of(query.samples, **geometry) <= 1:
+        raise ValueError(
+            f"a pupil of {query.samples} samples is too coarse at {wavelength * 1e9:.4g} nm: its replicas would enter "
+            f"the window. Use samples >= {needed}, or leave samples out."
+        )
+    return query.samples + query.samples % 2
+
+
+def _groups(query: Query, displacement: Tensor, *, method: str) -> Iterator[tuple[list[int], int, float]]:
+    """Wavelengths that share a grid: (their indices, pupil samples, points per pixel)."""
+    groups: dict[tuple[int, float, int], list[int]] = {}
+    for index, wavelength in enumerate(query.wavelengths.tolist()):
+        count = grid_samples(query, displacement=displacement, wavelength=wavelength, index=index)
+        own_grid = index if method == "fft" else -1  # its pupil grid scales with the wavelength
+        groups.setdefault((count, query.evaluation_grid(wavelength)[0], own_grid), []).append(index)
+    for (count, per_pixel, _), members in groups.items():
+        yield members, count, per_pixel
+
+
+def _grid_group(
+    query: Query, members: list[int], *, count: int, per_pixel: float, method: str, displacement: Tensor
+) -> Tensor:
+    wavelengths = query.wavelengths[members].to(query.device)
+    wavenumbers = 2 * math.pi / wavelengths
+    scales = wavenumbers * query.image_side_semi_aperture / query.sensor_distance
+    step = query.pixel_pitch / per_pixel
+    reach = math.ceil(per_pixel * query.half_pixels)
+    like = torch.empty(0, dtype=query.dtype, device=query.device)
+
+    spacing, length = grid_spacing(count), 0
+    if method == "fft":
+        scale = float(scales[0].detach())
+        extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]]))
+        length = fast_length(max(math.ceil(extent / step), 2 * reach + 1))
+        spacing = 2 * math.pi / (length * scale * step)
+        count = 2 * math.ceil(1 / spacing + 6)
+        length = max(length, fast_length(count))
+        spacing = 2 * math.pi / (length * scale * step)
+        count = min(2 * math.ceil(1 / spacing + 6), length)
+    nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
+
+    x, y = from_image_side(nodes[None, :].to(query.device), nodes[:, None].to(query.device), query.tau)
+    pupil = query.pupil(x, y)
+    coefficients, maps = residual_path(_replace_wavelengths(query, query.wavelengths[members]), pupil)
+    amplitude, energy = _amplitude(query, pupil, count=count, spacing=spacing)
+    field = _pixel_field(query, members, count=count, spacing=spacing)
+
+    build: dict[str, Callable[[float], object]] = {
+        "matrix": lambda s: MatrixTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
+        "chirp_z": lambda s: ChirpZTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
+        "fft": lambda s: FFTTransform(count, length, reach),
+    }
+    intensity = pupil_intensity(
+        (wavenumbers[:, None, None] * coefficients).to(query.dtype),
+        maps=maps.to(query.dtype),
+        amplitude=amplitude.to(query.dtype),
+        field=field,
+        scales=scales.to(query.dtype),
+        transforms=[build[method](float(s)) for s in scales.detach()],
+        nodes=nodes,
+        step=step,
+    )
+    # |sum w P|^2 -> energy per pixel: (a'^2 h^2)^2 p^2 / (lambda d)^2 / E
+    area = query.image_side_semi_aperture**2 * spacing**2
+    factor = area * query.pixel_pitch**2 / (wavelengths * query.sensor_distance)[:, None] ** 2 / energy
+    return to_pixels(intensity, query, per_pixel=per_pixel, reach=reach) * factor[..., None, None].to(query.dtype)
+
+
+def _replace_wavelengths(query: Query, wavelengths: Tensor) -> Query:
+    return replace(query, wavelengths=wavelengths)
+
+
+def _amplitude(query: Query, pupil: Pupil, *, count: int, spacing: float) -> tuple[Tensor, Tensor]:
+    """Quadrature weights times transmission, obliquity and source amplitude, (1 or Z, N, N), and their energy (1 or Z,)."""
+    aperture = query.lens.aperture
+    if aperture.discs():
+        weights = torch.zeros(count // 2, count // 2, dtype=torch.float64)
+        tau = float(query.tau.detach())
+        for radius, weight in aperture.discs():
+            image_side = radius * math.sqrt((1 + tau) / (1 + tau * radius**2))
+            weights = weights + weight * disc_weights(count, spacing=spacing, radius=image_side)
+        transmission = power = unfold_quadrant(weights).to(query.device)
+        if query.lens.has_pixel_phase:
+            transmission = torch.ones_like(power)  # the rim cuts the map's pixels: `_pixel_field` brings both together
+    else:
+        mask = aperture.pixel_map(query.wavelengths)
+        lowpass = _map_weights_of(query, mask.values.shape[-1], 1.0, count=count, spacing=spacing, extend=False)
+        values = mask.values.to(query.device, query.dtype)
+        transmission, power = lowpass.forward(torch.stack([values, values**2]))
+    amplitude, energy = transmission[None], power[None]
+    if not query.paraxial:
+        # a spherical wave's amplitude falls as 1 / R over the pupil: 1 / sqrt(1 + V^2 r^2)
+        r2 = pupil.rho2 * query.semi_aperture**2
+        falloff = 1 / (1 + query.vergences[:, None, None] ** 2 * r2)
+        amplitude = amplitude * pupil.measure * torch.sqrt(falloff)
+        energy = energy * pupil.measure**2 * falloff
+    return amplitude, energy.sum((-2, -1))
+
+
+def _map_weights_of(
+    query: Query, pixels: int, half_width: float, *, count: int, spacing: float, extend: bool
+) -> MapWeights:
+    tau = float(query.tau.detach())
+    # inside a block a pixel's edge moves by up to k w a tau / 2d / blocks of phase at the corner of pupil and window
+    wavenumber = 2 * math.pi / float(query.wavelengths.min())
+    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
+    blocks = math.ceil(wavenumber * query.half_window * a * tau / (2 * d) / _BLOCK_PHASE) if tau else 1
+    return map_weights(
+        pixels,
+        half_width=half_width,
+        count=count,
+        tau=tau,
+        blocks=max(1, min(_MAX_BLOCKS, blocks)),
+        spacing=spacing,
+        extend=extend,
+        dtype=query.dtype,
+    ).to(query.device)
+
+
+def _pixel_field(query: Query, members: list[int], *, count: int, spacing: float) -> Pair | None:
+    """exp(i phi) of all phase maps on flat pixels, low-passed onto the pupil grid: real and imaginary part (G, N, N).
+
+    Where the aperture is round, its rim is cut out of the pixels before the low-pass, by the exact area of each cell.
+    """
+    field: Pair | None = None
+    wavelengths = query.wavelengths[members].to(query.device)
+    discs = query.lens.aperture.discs()
+    for element in query.lens.elements:
+        pixels = element.pixel_map(wavelengths)
+        if pixels is None or pixels.factors is None:
+            continue
+        semi = float(query.semi_aperture.detach())
+        half_width = 1.0 if pixels.half_width is None else float(pixels.half_width) / semi
+        phase = pixels.values.to(query.device, query.dtype)
+        coverage = None
+        if discs:
+            # a map that ends inside the aperture continues with its outermost pixels
+            n = phase.shape[-1]
+            missing = max(0, math.ceil((1 - half_width) * n / (2 * half_width) - 1e-9))
+            if missing:
+                phase = torch.nn.functional.pad(phase[None, None], (missing,) * 4, mode="replicate")[0, 0]
+                half_width *= phase.shape[-1] / n
+            refine = math.ceil(_CELLS_PER_SAMPLE * count / phase.shape[-1] / half_width)
+            phase = phase.repeat_interleave(refine, 0).repeat_interleave(refine, 1)
+            coverage = sum(w * disc_coverage(phase.shape[-1], half_width=half_width, radius=r) for r, w in discs)
+            coverage = coverage.to(phase)
+            discs = ()  # cut once
+        weights = _map_weights_of(
+            query, phase.shape[-1], half_width, count=count, spacing=spacing, extend=coverage is None
+        )
+        own = _PixelField.apply(phase, pixels.factors.to(query.dtype), coverage, weights)
+        field = own if field is None else _complex_product(field, own)
+    return field
+
+
+def _complex_product(a: Pair, b: Pair) -> Pair:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+class _PixelField(torch.autograd.Function):
+    """Low-passed coverage * exp(i factor * phase) for each factor; only the phase is kept for the backward pass."""
+
+    @staticmethod
+    def forward(ctx, phase, factors, coverage, weights):
+        ctx.save_for_backward(phase, factors)
+        ctx.coverage, ctx.weights = coverage, weights
+        angle = factors[:, None, None] * phase
+        field = weights.forward(_covered(torch.cat([angle.cos(), angle.sin()]), coverage))
+        field = field.unflatten(0, (2, -1))
+        return field[0], field[1]
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_re, grad_im):
+        phase, factors = ctx.saved_tensors
+        onto = _covered(ctx.weights.adjoint(torch.cat([grad_re, grad_im])), ctx.coverage).unflatten(0, (2, -1))
+        angle = factors[:, None, None] * phase
+        total = (factors[:, None, None] * (angle.cos() * onto[1] - angle.sin() * onto[0])).sum(0)
+        return total, None, None, None
+
+
+def _covered(field: Tensor, coverage: Tensor | None) -> Tensor:
+    return field if coverage is None else field * coverage
+
+
+def to_pixels(intensity: Tensor, query: Query, *, per_pixel: float, reach: int) -> Tensor:
+    """Mean intensity over each pixel (or its value at the centre), (..., 2K+1, 2K+1) -> (..., H, W)."""
+    rows, columns = (
+        sampling.pixel_box(n, per_pixel=per_pixel, reach=reach, active=query.active)
+        if query.integrate
+        else sampling.point_comb(n, reach=reach)
+        for n in query.shape
+    )
+    if not query.integrate and query.shape[0] == query.shape[1] and query.shape[0] == 2 * reach + 1:
+        return intensity
+    return rows.to(intensity) @ intensity @ columns.to(intensity).mT

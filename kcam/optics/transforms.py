@@ -1,0 +1,385 @@
+"""From the pupil to the sensor: the Fourier transforms that hit the pixel grid, and their adjoints.
+
+All compute U(x, y) = sum_jk P(xi_j, eta_k) exp(-i s (x xi_j + y eta_k)) for points x = m * step, m = -K..K, and differ in
+cost alone. Each is used through `pupil_intensity`, which forms P from its phase, keeps only U for the backward pass
+and computes sines and cosines again there (a bank of PSFs would otherwise hold every pupil in memory).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
+
+
+def fast_length(minimum: int) -> int:
+    """The smallest length >= `minimum` that FFTs like: no prime factor above 7, a multiple of 32 from 256 up."""
+    step = 32 if minimum >= 256 else 2 if minimum > 2 else 1
+    length = math.ceil(minimum / step) * step
+    while True:
+        rest = length
+        for factor in (2, 3, 5, 7):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return length
+        length += step
+
+
+@contextlib.contextmanager
+def full_precision(device: torch.device) -> Iterator[None]:
+    """No autocast and no reduced-precision matrix products: their 1e-3 would be read as light (restored on exit)."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        with torch.autocast(device.type, enabled=False):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+class Transform(Protocol):
+    """One Fourier transform with its adjoint, in the layout that suits it."""
+
+    def arrange(self, maps: Tensor) -> Tensor:
+        """Pupil maps (..., N, N) in this transform's layout."""
+
+    def disarrange(self, maps: Tensor) -> Tensor:
+        """The inverse of `arrange`."""
+
+    def forward(self, pupil: Pair) -> Pair:
+        """Field on the points, up to a phase that |U|^2 does not see."""
+
+    def adjoint(self, field: Pair) -> Pair:
+        """Conjugate transpose of `forward`."""
+
+    def assemble(self, intensity: Tensor) -> Tensor:
+        """Intensity as an image (..., 2K+1, 2K+1)."""
+
+    def scatter(self, image: Tensor) -> Tensor:
+        """Transpose of `assemble`."""
+
+
+@dataclass(frozen=True)
+class MatrixTransform:
+    """Split matrix triple product: even and odd parts on both axes, so that real matrices of half the size do.
+
+    2 M N (N + M) real operations; any points that are symmetric about 0. Layout: quadrants ++, +-, -+, -- (sign of y, x),
+    each ordered away from the axis.
+    Source: Soummer et al., Opt. Express 15, 15935 (2007), for the matrix form; the split is exact algebra.
+    """
+
+    cosine_sine: Tensor  # (2, n, K + 1)
+
+    @staticmethod
+    def build(nodes: Tensor, *, scale: float, step: float, reach: int, like: Tensor) -> MatrixTransform:
+        """Matrices for pupil nodes (N,) symmetric about 0, kernel scale s [1/m] and points m * step, |m| <= reach."""
+        positive = nodes[nodes.numel() // 2 :]
+        angle = scale * step * positive[:, None] * torch.arange(reach + 1, dtype=torch.float64)
+        return MatrixTransform(torch.stack([angle.cos(), angle.sin()]).to(like))
+
+    def arrange(self, maps: Tensor) -> Tensor:
+        n = maps.shape[-1] // 2
+        low, high = maps[..., :n, :].flip(-2), maps[..., n:, :]
+        return torch.stack([high[..., n:], high[..., :n].flip(-1), low[..., n:], low[..., :n].flip(-1)], dim=-3)
+
+    def disarrange(self, maps: Tensor) -> Tensor:
+        pp, pm, mp, mm = maps.unbind(-3)
+        high = torch.cat([pm.flip(-1), pp], dim=-1)
+        low = torch.cat([mm.flip(-1), mp], dim=-1)
+        return torch.cat([low.flip(-2), high], dim=-2)
+
+    def forward(self, pupil: Pair) -> Pair:
+        batch, _, n, _ = pupil[0].shape
+        k = self.cosine_sine.shape[-1]
+        folded = pupil[0].new_empty(2, 2, 2, batch, n, n)  # parity in x, parity in y, re/im, batch, v, u
+        for part, values in enumerate(pupil):
+            pp, pm, mp, mm = values.unbind(1)
+            over, under = (pp + pm, mp + mm), (pp - pm, mp - mm)
+            for parity_x, (high, low) in enumerate((over, under)):
+                torch.add(high, low, out=folded[parity_x, 0, part])
+                torch.sub(high, low, out=folded[parity_x, 1, part])
+        along_x = torch.bmm(folded.view(2, 4 * batch * n, n), self.cosine_sine)
+        by_v = along_x.view(2, 2, 2 * batch, n, k).permute(1, 3, 0, 2, 4).reshape(2, n, 4 * batch * k)
+        parts = torch.bmm(self.cosine_sine.mT, by_v).view(
+            2, k, 2, 2, batch, k
+        )  # parity y, y, parity x, re/im, batch, x
+        (ee_r, ee_i), (eo_r, eo_i) = parts[0, :, 0].unbind(1), parts[0, :, 1].unbind(1)
+        (oe_r, oe_i), (oo_r, oo_i) = parts[1, :, 0].unbind(1), parts[1, :, 1].unbind(1)
+        # U(+-y, +-x) = ee -+ i eo -+ i oe -+ oo: the odd parts carry -i for each of their axes
+        real = self._combine(ee_r, oo_r, eo_i, oe_i)
+        imaginary = self._combine(ee_i, oo_i, -eo_r, -oe_r)
+        return real, imaginary
+
+    @staticmethod
+    def _combine(even: Tensor, odd: Tensor, odd_x: Tensor, odd_y: Tensor) -> Tensor:
+        difference, total = even - odd, even + odd
+        both, cross = odd_x + odd_y, odd_y - odd_x
+        return torch.stack([difference + both, total + cross, total - cross, difference - both]).permute(2, 0, 1, 3)
+
+    def adjoint(self, field: Pair) -> Pair:
+        batch, _, k, _ = field[0].shape
+        n = self.cosine_sine.shape[1]
+        parts = field[0].new_empty(2, k, 2, 2, batch, k)
+        for part, values in enumerate(field):
+            pp, pm, mp, mm = values.transpose(0, 1).transpose(1, 2).unbind(0)  # each (y, batch, x)
+            parts[0, :, 0, part] = pp + pm + mp + mm
+            parts[1, :, 1, part] = pm + mp - pp - mm
+            # transposes of the terms in eo and oe: real parts took +im, imaginary parts took -re
+            odd_x, odd_y = pp - pm + mp - mm, pp + pm - mp - mm
+            if part == 0:
+                parts[0, :, 1, 1], parts[1, :, 0, 1] = odd_x, odd_y
+            else:
+                parts[0, :, 1, 0], parts[1, :, 0, 0] = -odd_x, -odd_y
+        by_v = torch.bmm(self.cosine_sine, parts.view(2, k, 4 * batch * k))
+        along_x = by_v.view(2, n, 2, 2 * batch, k).permute(2, 0, 3, 1, 4).reshape(2, 4 * batch * n, k)
+        folded = torch.bmm(along_x, self.cosine_sine.mT).view(2, 2, 2, batch, n, n)
+        pupil = []
+        for part in range(2):
+            (ee, eo), (oe, oo) = folded[0, :, part], folded[1, :, part]  # [parity x, parity y]
+            even, odd = (ee + oe, ee - oe), (eo + oo, eo - oo)  # x > 0, x < 0
+            pupil.append(torch.stack([even[0] + odd[0], even[1] + odd[1], even[0] - odd[0], even[1] - odd[1]], dim=1))
+        return pupil[0], pupil[1]
+
+    def assemble(self, intensity: Tensor) -> Tensor:
+        pp, pm, mp, mm = intensity.unbind(-3)
+        down = torch.cat([pm[..., 1:].flip(-1), pp], dim=-1)
+        up = torch.cat([mm[..., 1:].flip(-1), mp], dim=-1)
+        return torch.cat([up[..., 1:, :].flip(-2), down], dim=-2)
+
+    def scatter(self, image: Tensor) -> Tensor:
+        k = self.cosine_sine.shape[-1] - 1
+        down, up = image[..., k:, :], image[..., :k, :].flip(-2)
+        up = torch.nn.functional.pad(up, (0, 0, 1, 0))  # the axis belongs to the positive side
+        left = [torch.nn.functional.pad(half[..., :k].flip(-1), (1, 0)) for half in (down, up)]
+        return torch.stack([down[..., k:], left[0], up[..., k:], left[1]], dim=-3)
+
+
+@dataclass(frozen=True)
+class _PlainLayout:
+    """Layout of the transforms that work on the whole grid."""
+
+    def arrange(self, maps: Tensor) -> Tensor:
+        return maps
+
+    disarrange = assemble = scatter = arrange
+
+
+@dataclass(frozen=True)
+class ChirpZTransform(_PlainLayout):
+    """Bluestein's chirp-z transform on both axes: exact like the matrix form, O(L^2 log L).
+
+    m j = (m^2 + j^2 - (m - j)^2) / 2 turns the sum into a convolution of length L >= N + M - 1.
+    Source: Bluestein 1970; Hu et al., Light Sci. Appl. 9, 119 (2020).
+    """
+
+    before: Tensor  # (N,) chirp on the samples
+    spectrum: Tensor  # (L,) transform of the convolving chirp
+    after: Tensor  # (M,)
+
+    @staticmethod
+    def build(nodes: Tensor, *, scale: float, step: float, reach: int, like: Tensor) -> ChirpZTransform:
+        """Chirps for equally spaced nodes, built in float64 (their arguments reach thousands of radians)."""
+        count, points = nodes.numel(), 2 * reach + 1
+        alpha = scale * step * float(nodes[1] - nodes[0])
+        j, m = torch.arange(count, dtype=torch.float64), torch.arange(points, dtype=torch.float64)
+        length = fast_length(count + points - 1)
+        lag = torch.arange(length, dtype=torch.float64)
+        lag = torch.where(lag < points, lag, lag - length)  # lags -(N-1)..M-1, wrapped
+        centre = (count - 1) / 2
+
+        def phasor(angle: Tensor) -> Tensor:
+            return torch.complex(angle.cos(), angle.sin())
+
+        complex_dtype = torch.complex128 if like.dtype == torch.float64 else torch.complex64
+        return ChirpZTransform(
+            before=phasor(-alpha * (j**2 / 2 - reach * j)).to(like.device, complex_dtype),
+            spectrum=torch.fft.fft(phasor(alpha * lag**2 / 2)).to(like.device, complex_dtype),
+            after=phasor(-alpha * (m**2 / 2 - centre * m)).to(like.device, complex_dtype),
+        )
+
+    def forward(self, pupil: Pair) -> Pair:
+        field = torch.complex(*pupil)
+        for _ in range(2):  # along x, then (transposed) along y
+            spectrum = torch.fft.fft(field * self.before, n=self.spectrum.numel()) * self.spectrum
+            field = (torch.fft.ifft(spectrum)[..., : self.after.numel()] * self.after).mT
+        return field.real, field.imag
+
+    def adjoint(self, field: Pair) -> Pair:
+        values = torch.complex(*field)
+        for _ in range(2):
+            values = values.mT * self.after.conj()
+            spectrum = torch.fft.fft(values, n=self.spectrum.numel()) * self.spectrum.conj()
+            values = torch.fft.ifft(spectrum)[..., : self.before.numel()] * self.before.conj()
+        return values.real, values.imag
+
+
+@dataclass(frozen=True)
+class FFTTransform(_PlainLayout):
+    """One padded FFT, as equation (3.4) has it, on a pupil grid scaled so that its bins fall exactly on the points.
+
+    Valid for nodes with scale * step * spacing = 2 pi / length.
+    """
+
+    count: int
+    length: int
+    reach: int
+
+    def forward(self, pupil: Pair) -> Pair:
+        spectrum = torch.fft.fft2(torch.complex(*pupil), s=(self.length, self.length))
+        bins = torch.arange(-self.reach, self.reach + 1, device=spectrum.device) % self.length
+        # the grid's origin is at (N - 1) / 2, the FFT's at 0: a pure phase on U, but the adjoint must know it too
+        field = spectrum[..., bins, :][..., bins] * self._shift(spectrum)
+        return field.real, field.imag
+
+    def adjoint(self, field: Pair) -> Pair:
+        values = torch.complex(*field)
+        values = values * self._shift(values).conj()
+        bins = torch.arange(-self.reach, self.reach + 1, device=values.device) % self.length
+        spectrum = values.new_zeros(*values.shape[:-2], self.length, self.length)
+        spectrum[..., bins[:, None], bins[None]] = values
+        pupil = torch.fft.ifft2(spectrum, norm="forward")[..., : self.count, : self.count]
+        return pupil.real, pupil.imag
+
+    def _shift(self, like: Tensor) -> Tensor:
+        m = torch.arange(-self.reach, self.reach + 1, device=like.device, dtype=torch.float64)
+        angle = 2 * math.pi * m * ((self.count - 1) / 2) / self.length
+        phase = torch.complex(angle.cos(), angle.sin()).to(like.dtype)
+        return phase[:, None] * phase[None, :]
+
+
+class _PupilIntensity(torch.autograd.Function):
+    """|transform(amplitude * field * exp(i coefficients @ maps))|^2 for each group, nothing kept but U."""
+
+    @staticmethod
+    def forward(ctx, coefficients, maps, amplitude, field_re, field_im, scales, transforms, nodes, step):
+        first = transforms[0]
+        laid = first.arrange(maps), first.arrange(amplitude)
+        fields = None if field_re is None else (first.arrange(field_re), first.arrange(field_im))
+        images, kept = [], []
+        for group, transform in enumerate(transforms):
+            pupil = _pupil(coefficients[group], laid, fields, group)
+            re, im = transform.forward(pupil)
+            images.append(transform.assemble(re.square() + im.square()))  # never abs()**2: its gradient is NaN at 0
+            kept += [re, im]
+        ctx.transforms, ctx.nodes, ctx.step = transforms, nodes, step
+        ctx.has_field = field_re is not None
+        fields_kept = (field_re, field_im) if ctx.has_field else ()
+        ctx.save_for_backward(coefficients, maps, amplitude, *fields_kept, *kept)
+        return torch.stack(images)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        coefficients, maps, amplitude, *rest = ctx.saved_tensors
+        first = ctx.transforms[0]
+        laid = first.arrange(maps), first.arrange(amplitude)
+        fields = None
+        if ctx.has_field:
+            fields, rest = (first.arrange(rest[0]), first.arrange(rest[1])), rest[2:]
+        need_coefficients, need_maps, need_amplitude, need_field, _, need_scale = ctx.needs_input_grad[:6]
+        d_coefficients = torch.empty_like(coefficients)
+        d_maps = torch.zeros_like(laid[0]) if need_maps else None
+        d_amplitude = torch.zeros_like(laid[1]) if need_amplitude else None
+        d_field = ([], [])
+        d_scale = []
+        with full_precision(grad.device):
+            for group, transform in enumerate(ctx.transforms):
+                re, im = rest[2 * group], rest[2 * group + 1]
+                weight = 2 * transform.scatter(grad[group])
+                d_re, d_im = transform.adjoint((weight * re, weight * im))
+                pupil = _pupil(coefficients[group], laid, fields, group)
+                # P = A F exp(i phi): d phi = Re(conj(dP) i P) = d_im Re P - d_re Im P
+                d_phase = d_im * pupil[0] - d_re * pupil[1]
+                flat = d_phase.flatten(1)
+                d_coefficients[group] = flat @ laid[0].flatten(1).T
+                if need_maps:
+                    d_maps += (coefficients[group].T @ flat).view_as(d_maps)
+                if need_amplitude or need_field:
+                    bare = _pupil(coefficients[group], (laid[0], None), None, group)  # exp(i phi)
+                    # onto A F: conj(exp(i phi)) dP
+                    turned = (bare[0] * d_re + bare[1] * d_im, bare[0] * d_im - bare[1] * d_re)
+                    if need_field:
+                        for part in range(2):
+                            d_field[part].append((turned[part] * laid[1]).sum(0))
+                    if need_amplitude:
+                        onto = turned[0]
+                        if fields is not None:
+                            onto = turned[0] * fields[0][group] + turned[1] * fields[1][group]
+                        d_amplitude += onto if d_amplitude.shape[0] == onto.shape[0] else onto.sum(0, keepdim=True)
+                if need_scale:
+                    d_scale.append(_scale_gradient(transform, pupil, (weight * re, weight * im), ctx.nodes, ctx.step))
+        return (
+            d_coefficients if need_coefficients else None,
+            first.disarrange(d_maps) if need_maps else None,
+            first.disarrange(d_amplitude) if need_amplitude else None,
+            first.disarrange(torch.stack(d_field[0])) if need_field else None,
+            first.disarrange(torch.stack(d_field[1])) if need_field else None,
+            torch.stack(d_scale) if need_scale else None,
+            None,
+            None,
+            None,
+        )
+
+
+def _pupil(coefficients: Tensor, laid: tuple[Tensor, Tensor | None], fields: Pair | None, group: int) -> Pair:
+    """Real and imaginary part of amplitude * field * exp(i phase) for the distances of one group."""
+    maps, amplitude = laid
+    phase = (coefficients @ maps.flatten(1)).view(coefficients.shape[0], *maps.shape[1:])
+    re, im = phase.cos(), phase.sin()  # torch.polar costs five times as much
+    if amplitude is not None:
+        re *= amplitude
+        im *= amplitude
+    if fields is None:
+        return re, im
+    f_re, f_im = fields[0][group], fields[1][group]
+    return re * f_re - im * f_im, re * f_im + im * f_re
+
+
+def _scale_gradient(transform: Transform, pupil: Pair, d_field: Pair, nodes: Tensor, step: float) -> Tensor:
+    """d(loss)/ds: s only stretches the points, dU/ds = -i (x T[xi P] + y T[eta P])."""
+    total = pupil[0].new_zeros(())
+    grid = nodes.to(pupil[0])
+    count = nodes.numel()
+    for axis in range(2):
+        ramp = (grid[None, :] if axis == 0 else grid[:, None]).expand(count, count)
+        ramp = transform.arrange(ramp)
+        re, im = transform.forward((pupil[0] * ramp, pupil[1] * ramp))
+        product = transform.assemble(d_field[0] * im - d_field[1] * re)  # Re(conj(dU) (-i) T)
+        points = (torch.arange(product.shape[-1], device=grid.device) - product.shape[-1] // 2).to(grid) * step
+        total = total + (product * (points if axis == 0 else points[:, None])).sum()
+    return total
+
+
+def pupil_intensity(
+    coefficients: Tensor,
+    *,
+    maps: Tensor,
+    amplitude: Tensor,
+    field: Pair | None,
+    scales: Tensor,
+    transforms: list[Transform],
+    nodes: Tensor,
+    step: float,
+) -> Tensor:
+    """Intensity of the transformed pupils amplitude * field * exp(i coefficients @ maps).
+
+    Args:
+        coefficients: (G, Z, T) of the phase's maps [rad per unit of the map]; G groups share a kernel.
+        maps: (T, N, N). amplitude: (1 or Z, N, N), quadrature weights included.
+        field: real and imaginary part (G, N, N) of what does not fit into a phase (a low-passed pixel map), or None.
+        scales: (G,) kernel scales s [1/m], for their gradient. transforms: one for each group, built with that scale.
+        nodes: (N,) normalised nodes; step: distance of the points [m].
+    Returns:
+        (G, Z, 2K+1, 2K+1); differentiable once in all tensors.
+    """
+    re, im = field if field is not None else (None, None)
+    with full_precision(coefficients.device):
+        return _PupilIntensity.apply(coefficients, maps, amplitude, re, im, scales, transforms, nodes, step)

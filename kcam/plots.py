@@ -1,0 +1,363 @@
+"""Figures of pictures and PSFs, drawn with matplotlib's object interface, so that nothing global changes."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+from torch import Tensor
+from torch.nn import functional as F
+
+from kcam import optics, sensor, spectral
+from kcam.sensor.mosaic import pattern_tile
+from kcam.units import nm, um
+
+INK, MUTED, FAINT = "#1c1c22", "#75757f", "#e2e2e8"
+TITLE, LABEL, SMALL = 15.0, 10.0, 8.5
+CHANNEL_COLOURS = ((1.0, 0.18, 0.12), (0.2, 0.9, 0.25), (0.2, 0.35, 1.0), (1.0, 1.0, 1.0))
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
+
+
+def check_writable(path: str | os.PathLike[str], *, suffixes: Sequence[str] = PICTURE_SUFFIXES) -> None:
+    """Fail before the work and not after it: ValueError for a suffix that cannot be written, or a missing folder."""
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"cannot write {path.name}: its name must end in one of {', '.join(suffixes)}.")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"cannot write {path.name}: there is no folder {path.parent}.")
+
+
+def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int = 95) -> None:
+    """Write a picture (3,H,W) in [0,1] as 8 bits; the suffix names the format. Raises: as `check_writable`."""
+    check_writable(path)
+    pixels = (as_image(picture) * 255).round().astype(np.uint8)
+    options: dict[str, Any] = {"quality": quality} if Path(path).suffix.lower() in {".jpg", ".jpeg", ".webp"} else {}
+    Image.fromarray(pixels).save(path, **options)
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str], *, resolution: float = 144) -> None:
+    """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`."""
+    check_writable(path, suffixes=FIGURE_SUFFIXES)
+    figure.savefig(path, dpi=resolution, facecolor="white")
+
+
+def as_image(picture: Tensor) -> np.ndarray:
+    """A picture (C,H,W), C = 1 or 3, as an array (H,W,3) in [0,1]."""
+    image = picture.detach().float().clamp(0, 1).cpu().nan_to_num()
+    return image.expand(3, -1, -1).permute(1, 2, 0).numpy()
+
+
+def light_colours(wavelengths: Tensor) -> np.ndarray:
+    """A colour for each wavelength, (L,3) sRGB in [0,1]: as the CIE 1931 observer sees it, as pure as a screen can."""
+    linear = spectral.observer(wavelengths).double() @ spectral.xyz_to_srgb_matrix().T
+    return _pure(linear - linear.amin(-1, keepdim=True).clamp(max=0))  # the least white that makes it a real colour
+
+
+def _pure(linear: Tensor) -> np.ndarray:
+    """Linear sRGB (..., 3) at full brightness, coded."""
+    return ((linear / linear.amax(-1, keepdim=True).clamp(min=1e-9)) ** (1 / 2.2)).numpy()
+
+
+def mosaic_tile(camera: Any) -> np.ndarray:
+    """The colours of a camera's filter tile, (rows, columns, 3): the mosaic's pattern, or the learned tile's own."""
+    filters = [stage for stage in camera if isinstance(stage, sensor.ColourFilter)]
+    if filters and filters[0].is_tile:
+        wavelengths = torch.linspace(420, 720, 61, dtype=torch.float64) * nm
+        curves = (filters[0].alpha().double() @ filters[0].basis(wavelengths)).detach().cpu()
+        return _pure((curves @ spectral.observer(wavelengths).double() @ spectral.xyz_to_srgb_matrix().T).clamp(min=0))
+    mosaics = [stage for stage in camera if isinstance(stage, sensor.Mosaic)]
+    if not mosaics:
+        return np.ones((1, 1, 3))
+    return np.asarray(CHANNEL_COLOURS)[pattern_tile(mosaics[0].pattern).numpy()]
+
+
+def false_colour(raw: Tensor, tile: np.ndarray) -> np.ndarray:
+    """A raw plane (1,H,W) with each pixel in the colour of its filter, (H,W,3), bright enough for a screen."""
+    plane = raw[0].detach().float().clamp(0, 1).cpu()
+    plane = (plane / plane.amax().clamp(min=1e-6)) ** (1 / 2.2)
+    rows, columns, _ = tile.shape
+    height, width = plane.shape
+    colours = np.tile(tile, (-(-height // rows), -(-width // columns), 1))[:height, :width]
+    return np.clip(plane.numpy()[..., None] * colours, 0, 1)
+
+
+class Sheet:
+    """A figure whose parts are placed in inches from its top left corner, so that nothing overlaps at any size."""
+
+    def __init__(self, width: float, height: float) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width, height))
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Any:
+        """Axes at a place in inches."""
+        box = (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
+        return self.figure.add_axes(box)
+
+    def text(self, left: float, top: float, text: str, *, size: float = LABEL, colour: str = INK, **style: Any) -> None:
+        """Text whose top left corner is at a place in inches, unless `style` aligns it otherwise."""
+        style = {"va": "top", "ha": "left"} | style
+        self.figure.text(left / self.width, 1 - top / self.height, text, size=size, color=colour, **style)
+
+    def picture(
+        self, image: np.ndarray, left: float, top: float, width: float, height: float, *, smooth: bool = True
+    ) -> Any:
+        """A picture without axes."""
+        axes = self.axes(left, top, width, height)
+        axes.imshow(image, interpolation="antialiased" if smooth else "nearest", aspect="auto", vmin=0, vmax=1)
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+        return axes
+
+
+def pipeline_figure(
+    *,
+    scene: Tensor,
+    raw: Tensor,
+    picture: Tensor,
+    tile: np.ndarray,
+    times: Sequence[tuple[str, float]],
+    title: str,
+    subtitle: str,
+    zoom: tuple[float, float] = (0.5, 0.5),
+    zoom_size: int = 56,
+) -> Figure:
+    """From scene to picture: both, the raw mosaic between them, a detail of each, and the time that each stage took.
+
+    Args:      scene, picture: (3,H,W) sRGB.  raw: (1,H,W).  tile: see `mosaic_tile`.
+               times: (stage, seconds).
+               zoom: centre of the detail as shares of the height and the width.  zoom_size: its width [pixels].
+    """
+    raw_colours = false_colour(raw, tile)
+    panels = [
+        ("Scene", as_image(scene)),
+        ("Raw, in the colours of its filters", _mixed(raw_colours, len(tile))),
+        ("Picture", as_image(picture)),
+    ]
+    height, width = panels[0][1].shape[:2]
+    side, gap, edge, head, caption = 3.5, 0.22, 0.4, 1.0, 0.3
+    tall = side * height / width
+    detail = side * 0.62
+    rows = round(zoom_size * detail / side)
+    y = int(np.clip(round(zoom[0] * height - rows / 2), 0, max(height - rows, 0)))
+    x = int(np.clip(round(zoom[1] * width - zoom_size / 2), 0, max(width - zoom_size, 0)))
+
+    bars = 3.1
+    sheet = Sheet(2 * edge + 3 * side + 3 * gap + bars + 0.25, head + caption + tall + gap + detail + edge)
+    sheet.text(edge, 0.32, title, size=TITLE, weight="bold")
+    sheet.text(edge, 0.64, subtitle, colour=MUTED)
+    for index, (label, image) in enumerate(panels):
+        left, top = edge + index * (side + gap), head
+        sheet.text(left, top, label, weight="bold")
+        axes = sheet.picture(image, left, top + caption, side, tall)
+        for line, colour in ((2.6, "black"), (1.2, "white")):
+            axes.add_patch(
+                matplotlib.patches.Rectangle((x - 0.5, y - 0.5), zoom_size, rows, fill=False, lw=line, ec=colour)
+            )
+        crop = (raw_colours if index == 1 else image)[y : y + rows, x : x + zoom_size]
+        sheet.picture(crop, left, top + caption + tall + gap, side, detail, smooth=False)
+    left = edge + 3 * (side + gap) + 0.25
+    _time_bars(sheet, times, left=left, top=head, width=bars - edge / 2, height=caption + tall + gap + detail)
+    return sheet.figure
+
+
+def _mixed(image: np.ndarray, tile: int) -> np.ndarray:
+    """The mean over a tile around each pixel: shown smaller than it is, a mosaic would make moire."""
+    width = min(tile, 6)
+    planes = F.pad(torch.from_numpy(image).permute(2, 0, 1), (0, width - 1, 0, width - 1), "replicate")
+    return F.avg_pool2d(planes, width, stride=1).permute(1, 2, 0).numpy()
+
+
+def _time_bars(
+    sheet: Sheet, times: Sequence[tuple[str, float]], *, left: float, top: float, width: float, height: float
+) -> None:
+    total = sum(seconds for _, seconds in times)
+    sheet.text(left, top, f"Time of each stage, {duration(total)} in all", weight="bold")
+    step = min((height - 0.3) / len(times), 0.52)
+    longest = max(seconds for _, seconds in times)
+    for index, (name, seconds) in enumerate(times):
+        line = top + 0.36 + index * step
+        sheet.text(left, line, name, size=SMALL + 0.5)
+        sheet.text(left + width, line, duration(seconds), size=SMALL + 0.5, colour=MUTED, ha="right")
+        axes = sheet.axes(left, line + 0.2, width, 0.07)
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        axes.axis("off")
+        axes.barh(0.5, 1, height=1, color=FAINT)
+        axes.barh(0.5, seconds / longest, height=1, color="#3f6fd8")
+
+
+def duration(seconds: float) -> str:
+    """A time for people: three figures at most."""
+    if seconds >= 0.9995:
+        return f"{seconds:.3g} s" if seconds < 100 else f"{seconds:.0f} s"
+    return f"{seconds * 1e3:.0f} ms" if seconds >= 0.01 else f"{seconds * 1e3:.1f} ms"
+
+
+CURVE_COLOURS = ("#c8553d", "#1c1c22", "#2a9d8f", "#3f6fd8", "#8f5fbf", "#b8860b")
+
+
+def psf_figure(
+    imaging: optics.Imaging,
+    *,
+    distances: Sequence[float] | None = None,
+    wavelengths: Sequence[float] | None = None,
+    title: str,
+) -> Figure:
+    """PSFs over wavelength and distance, in the colour of their light, beside the MTF and the encircled energy.
+
+    Each PSF is scaled to its own peak, and its square root is shown, so that a hundredth of the peak is still visible.
+
+    Args:      distances: [m], inf allowed; None for 0.4 times the focus, the focus, 2.5 times that, and infinity.
+               wavelengths: [m]; None for 450, 500, 550, 600 and 650 nm.
+    """
+    lens, pitch = imaging.lens, float(imaging.pixel_pitch)
+    focus = lens.focus_distance
+    if distances is None:
+        distances = [1.0, 3.0, 10.0, math.inf] if not 0 < focus < 1e3 else [0.4 * focus, focus, 2.5 * focus, math.inf]
+    colours_at = torch.tensor(wavelengths or [450 * nm, 500 * nm, 550 * nm, 600 * nm, 650 * nm], dtype=torch.float64)
+    bands = torch.linspace(420, 720, 28, dtype=torch.float64) * nm
+    shape = imaging.psf_shape or (255, 255)
+    arguments: dict[str, Any] = {
+        "distances": torch.tensor(distances, dtype=torch.float64),
+        "pixel_pitch": pitch,
+        "shape": tuple(shape),
+        "propagator": imaging.propagator,
+        "method": imaging.method,
+    }
+    psf = lens.psf(colours_at, fill_factor=imaging.fill_factor, **arguments).detach().double().cpu()
+    reach = _reach(psf, share=0.97)
+    window = {"shape": (2 * reach + 1, 2 * reach + 1)}
+    daylight = lens.psf(bands, fill_factor=imaging.fill_factor, **(arguments | window)).detach().double().cpu()
+    daylight = torch.einsum("dlhw,lc->dchw", daylight, spectral.xyz_weights(bands, "D65"))
+    daylight = spectral.xyz_to_linear_srgb(daylight).clamp(min=0)
+    lit = [light_colours(colours_at)[index] for index in range(len(colours_at))]
+    cell, gap, edge, head, rim = 1.3, 0.07, 0.4, 1.35, 0.75
+    columns = len(lit) + 1
+    plots_left = edge + rim + columns * (cell + gap) + 0.95
+    plots_width, grid_height = 4.2, len(distances) * (cell + gap) - gap
+    plot_height = max((grid_height - 0.85) / 2, 1.8)
+    sheet = Sheet(plots_left + plots_width + edge, head + max(grid_height, 2 * plot_height + 0.85) + 0.75)
+    sheet.text(edge, 0.32, title, size=TITLE, weight="bold")
+    sheet.text(
+        edge,
+        0.64,
+        f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, in focus at {metres(focus)};  "
+        f"pixels of {pitch / um:.3g} \u00b5m;  each panel {2 * reach + 1} pixels wide, scaled to its own peak, "
+        "square root shown",
+        colour=MUTED,
+    )
+    for column in range(columns):
+        name = f"{colours_at[column] / nm:.0f} nm" if column < len(lit) else "daylight"
+        sheet.text(edge + rim + column * (cell + gap) + cell / 2, head - 0.24, name, ha="center")
+    for row, distance in enumerate(distances):
+        top = head + row * (cell + gap)
+        sheet.text(edge + rim - 0.14, top + cell / 2, metres(distance), ha="right", va="center")
+        for column in range(columns):
+            if column < len(lit):
+                image = _centre(psf[row, column], reach)[..., None].numpy() * lit[column] ** 2.2
+            else:
+                image = daylight[row].permute(1, 2, 0).numpy()
+            image = np.sqrt(image / max(image.max(), 1e-30)) ** (1 / 1.1)
+            sheet.picture(image, edge + rim + column * (cell + gap), top, cell, cell, smooth=False)
+    middle = colours_at[len(colours_at) // 2]
+    contrast, energy = (
+        sheet.axes(plots_left, head + index * (plot_height + 0.85), plots_width, plot_height) for index in (0, 1)
+    )
+    frequencies, mtf = _mtf(imaging, arguments, wavelength=float(middle))
+    count = min(40, int(reach * pitch / (0.35 * um)))  # much finer than the light itself
+    radii = torch.linspace(0, reach * pitch, count + 1)
+    disc = {"pixel_pitch": reach * pitch / count, "shape": (2 * count + 1, 2 * count + 1)}
+    light = lens.encircled_energy(middle[None], **(arguments | disc))[:, 0].detach().cpu()
+    for index, distance in enumerate(distances):
+        style = {"color": CURVE_COLOURS[index % len(CURVE_COLOURS)], "lw": 1.6, "label": metres(distance)}
+        contrast.plot(frequencies / 1e3, mtf[index], **style)
+        energy.plot(radii / um, light[index], **style)
+    name = f"{middle / nm:.0f} nm"
+    _finish(
+        contrast,
+        title=f"MTF at {name}, of lens and pixel",
+        label="line pairs per mm, up to the pixels' limit",
+        end=0.5 / pitch / 1e3,
+    )
+    _finish(energy, title=f"Light within a radius, {name}", label="radius [\u00b5m]", end=reach * pitch / um)
+    contrast.legend(frameon=False, fontsize=SMALL, labelcolor=INK)
+    return sheet.figure
+
+
+def _mtf(imaging: optics.Imaging, arguments: dict[str, Any], *, wavelength: float) -> tuple[Tensor, Tensor]:
+    """Frequencies [1/m] up to the pixels' limit, and at each distance the contrast of optics and pixel, not aliased.
+
+    Sampled finely enough that the lens passes nothing beyond the folded range; then the fine pixel's sinc is exchanged
+    for the pixel's own.
+    """
+    lens, pitch = imaging.lens, float(imaging.pixel_pitch)
+    cutoff = 1 / (wavelength * lens.f_number)
+    fine = max(1, math.ceil(cutoff * pitch + 0.5))
+    side = min(max(arguments["shape"]) * fine, 511)
+    finer = arguments | {"pixel_pitch": pitch / fine, "shape": (side, side)}
+    mtf = lens.mtf([wavelength], **finer)[:, 0, side // 2, side // 2 :].detach().double().cpu()
+    frequencies = torch.arange(mtf.shape[-1], dtype=torch.float64) * fine / (side * pitch)
+    width = pitch * math.sqrt(imaging.fill_factor)
+    mtf = mtf * torch.sinc(frequencies * width).abs() / torch.sinc(frequencies * pitch / fine)
+    shown = frequencies <= 0.5 / pitch + frequencies[1]
+    return frequencies[shown], mtf[:, shown]
+
+
+def _finish(axes: Any, *, title: str, label: str, end: float) -> None:
+    axes.set(xlim=(0, end), ylim=(0, 1.02), xlabel=label)
+    axes.set_title(title, size=LABEL, weight="bold", loc="left", color=INK)
+    axes.grid(color=FAINT, lw=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
+    axes.tick_params(labelsize=SMALL, colors=MUTED, length=3)
+    axes.xaxis.label.set(size=SMALL + 0.5, color=MUTED)
+
+
+def _reach(psf: Tensor, *, share: float) -> int:
+    """Half the width of the square around the origin that holds this share of every PSF's light in its window."""
+    height, width = psf.shape[-2:]
+    for reach in range(6, min(height, width) // 2):
+        inside = _centre(psf, reach).sum((-2, -1)) / psf.sum((-2, -1)).clamp(min=1e-30)
+        if bool((inside >= share).all()):
+            return reach
+    return (min(height, width) - 1) // 2
+
+
+def _centre(psf: Tensor, reach: int) -> Tensor:
+    row, column = (size // 2 for size in psf.shape[-2:])
+    return psf[..., row - reach : row + reach + 1, column - reach : column + reach + 1]
+
+
+def metres(distance: float) -> str:
+    """A distance for people."""
+    if math.isinf(distance):
+        return "infinity"
+    return f"{distance:.3g} m" if distance >= 1 else f"{distance * 100:.3g} cm"
+
+
+def contact_sheet(rows: Sequence[Sequence[Tensor]], *, titles: Sequence[str], labels: Sequence[str]) -> Figure:
+    """Pictures (3,H,W) in rows; all in a row have one shape.
+
+    Args:      rows: pictures.  titles: one per column.  labels: one per row.
+    """
+    side, gap, edge, head = 3.6, 0.12, 0.35, 0.75
+    heights = [side * row[0].shape[-2] / row[0].shape[-1] for row in rows]
+    columns = len(titles)
+    sheet = Sheet(2 * edge + columns * (side + gap) - gap, head + sum(heights) + len(rows) * 0.34 + edge / 2)
+    for index, title in enumerate(titles):
+        sheet.text(edge + index * (side + gap), 0.35, title, size=TITLE - 2, weight="bold")
+    top = head
+    for row, label, height in zip(rows, labels, heights, strict=True):
+        for index, picture in enumerate(row):
+            sheet.picture(as_image(picture), edge + index * (side + gap), top, side, height)
+        sheet.text(edge, top + height + 0.07, label, size=SMALL, colour=MUTED)
+        top += height + 0.34
+    return sheet.figure

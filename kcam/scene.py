@@ -1,0 +1,465 @@
+"""Scenes: the light that arrives from every direction and at every wavelength, and how far away it started.
+
+A scene is a cube of spectral radiance. It is stored as bands, or factored: K coefficient planes times K spectra, as
+pictures are (three planes and three spectra stand for 28 bands), and rendering makes use of the factors.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from torch import Tensor
+from torch.nn import functional as F
+
+from kcam import spectral
+from kcam.units import check_distances, check_positive, wavelength_grid
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene:
+    """Spectral radiance with depth, under a light.
+
+    radiance_l(x, y) = sum_k coefficients_k(x, y) * spectra_kl
+
+    The radiance is relative: a perfect white has the illuminant's spectrum, scaled to Y = 1, and `luminance` says how
+    bright it is. Derive scenes with the methods, or with `dataclasses.replace`. Gradients reach `coefficients`,
+    `spectra` and a tensor `depth`. Everything is checked here, so stages need not.
+
+    Args:      coefficients: (B,K,H,W); their dtype and device are the scene's.
+               spectra: (K,L), the light included; None if the coefficients are the bands, K = L.
+               wavelengths: (L,) [m], kept as float64 on the CPU; by default 28 from 420 to 720 nm.
+               depth: distance from the lens [m], inf allowed; a number, kept as a float, or a map (H,W), (1,1,H,W) or
+               (B,1,H,W), kept as the last.
+               illuminant: a name or (L,), see `spectral.illuminant`; kept as (L,) float64 on the CPU.
+               luminance: of a perfect white [cd/m^2].
+    Raises:    TypeError, ValueError for shapes that do not fit, integers, NaN or inf, negative radiance, depth <= 0.
+    """
+
+    coefficients: Tensor
+    spectra: Tensor | None = None
+    wavelengths: Tensor = field(default_factory=wavelength_grid)
+    depth: float | Tensor = 2.0
+    illuminant: Tensor = "D65"  # type: ignore[assignment]  # a name is replaced by its spectrum
+    luminance: float = 1000.0
+
+    def __post_init__(self) -> None:
+        planes, spectra = self.coefficients, self.spectra
+        if not isinstance(planes, Tensor) or not planes.is_floating_point():
+            raise TypeError(f"coefficients must be a floating-point tensor (B,K,H,W), got {_describe(planes)}.")
+        if planes.ndim != 4 or 0 in planes.shape[1:]:
+            raise ValueError(f"coefficients have shape {tuple(planes.shape)}, expected (B,K,H,W) with K, H, W >= 1.")
+        wavelengths = wavelength_grid(self.wavelengths)
+        bands, factors = len(wavelengths), planes.shape[1]
+        if spectra is not None:
+            if not isinstance(spectra, Tensor):
+                raise TypeError(f"spectra must be a tensor (K,L) or None, got {_describe(spectra)}.")
+            spectra = spectra.to(planes)
+            if spectra.shape != (factors, bands):
+                raise ValueError(
+                    f"spectra have shape {tuple(spectra.shape)}, expected ({factors}, {bands}): a row for each of the "
+                    f"{factors} coefficient planes, a column for each of the {bands} wavelengths."
+                )
+        elif factors != bands:
+            raise ValueError(
+                f"{factors} bands, but {bands} wavelengths: expected as many. Pass wavelengths= ({factors},) in metres."
+            )
+        _check_radiance(planes, spectra)
+        check_positive(self.luminance, name="luminance", unit="cd/m^2")
+        for name, value in (
+            ("spectra", spectra),
+            ("wavelengths", wavelengths),
+            ("depth", _depth_map(self.depth, planes)),
+            ("illuminant", spectral.illuminant(self.illuminant, wavelengths=wavelengths)),
+            ("luminance", float(self.luminance)),
+        ):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_rgb(
+        cls,
+        image: Tensor,
+        *,
+        depth: float | Tensor = 2.0,
+        wavelengths: Tensor | None = None,
+        illuminant: str | Tensor = "D65",
+        luminance: float = 1000.0,
+    ) -> Scene:
+        """A scene whose reflectance has the colours of an sRGB picture: white paint is 1, and the light falls on it.
+
+        reflectance = linear rgb @ `spectral.rgb_basis`: three factors, exactly; one, flat, for a grey picture. Under
+        D65 the scene has the colours of the picture; under another light, those that such paints would have there.
+
+        Args:      image: (3,H,W), (B,3,H,W), (1,H,W) or (B,1,H,W), sRGB in [0,1] as files have it (gamma-coded).
+                   Others: as for `Scene`.
+        Raises:    TypeError for integers or what is no tensor; ValueError for another shape or values outside [0,1].
+        """
+        if not isinstance(image, Tensor) or not image.is_floating_point():
+            raise TypeError(f"image must be a floating-point tensor (3,H,W) in [0,1], got {_describe(image)}.")
+        shape = tuple(image.shape)
+        image = image[None] if image.ndim == 3 else image
+        if image.ndim != 4 or image.shape[1] not in (1, 3):
+            hint = {
+                2: " Add the channel: image[None].",
+                3: " For (H,W,C) use image.permute(2, 0, 1).",
+                4: " For (B,H,W,C) use image.permute(0, 3, 1, 2).",
+            }.get(len(shape) if len(shape) == 2 or shape[-1:] in ((1,), (3,), (4,)) else 0, "")
+            raise ValueError(f"image has shape {shape}, expected 1 or 3 channels: (C,H,W) or (B,C,H,W).{hint}")
+        if image.numel():
+            low, high = (value.item() for value in image.detach().aminmax())
+            if not (low >= 0 and high <= 1):
+                fix = "Remove the NaNs." if low != low else "Use image / 255." if high > 2 else "Use image.clamp(0, 1)."
+                raise ValueError(f"image has values from {low:g} to {high:g}, expected sRGB in [0,1]. {fix}")
+        channels = image.shape[1]
+        linear = rgb_to_linear_rgb(image.expand(-1, 3, -1, -1))[:, :channels]
+        grid = wavelength_grid(wavelengths)
+        basis = spectral.rgb_basis(grid) if channels == 3 else torch.ones(1, len(grid))
+        light = spectral.illuminant(illuminant, wavelengths=grid)
+        return cls(linear, basis * light, grid, depth, light, luminance)
+
+    @classmethod
+    def from_bands(
+        cls,
+        bands: Tensor,
+        *,
+        wavelengths: Tensor | None = None,
+        depth: float | Tensor = 2.0,
+        illuminant: str | Tensor = "D65",
+        luminance: float = 1000.0,
+    ) -> Scene:
+        """A scene from a measured cube of spectral radiance.
+
+        The scale of the cube does not matter if the white that it was taken with is given as `illuminant`, (L,) in the
+        same unit. For a cube of *reflectance* R multiply by the light first:
+        ``Scene.from_bands(R * spectral.illuminant("D65", wavelengths=w)[:, None, None], wavelengths=w)``.
+
+        Args:      bands: (L,H,W) or (B,L,H,W), finite, >= 0.
+                   illuminant: by name, the light is normalised and `bands` taken as they are (white is E_l); as a
+                   tensor, the radiance of a perfect white in the unit of `bands`.
+                   Others: as for `Scene`.
+        """
+        if not isinstance(bands, Tensor):
+            raise TypeError(f"bands must be a floating-point tensor (L,H,W) or (B,L,H,W), got {_describe(bands)}.")
+        if bands.ndim not in (3, 4):
+            raise ValueError(f"bands have shape {tuple(bands.shape)}, expected (L,H,W) or (B,L,H,W).")
+        bands = bands[None] if bands.ndim == 3 else bands
+        grid = wavelength_grid(wavelengths)
+        light = spectral.illuminant(illuminant, wavelengths=grid)
+        if isinstance(illuminant, Tensor):
+            bands = bands * (light.sum() / illuminant.detach().double().cpu().sum()).item()
+        return cls(bands, None, grid, depth, light, luminance)
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        depth: float | Tensor = 2.0,
+        wavelengths: Tensor | None = None,
+        illuminant: str | Tensor = "D65",
+        luminance: float = 1000.0,
+    ) -> Scene:
+        """A scene from a photograph, taken as sRGB; see `read_picture` and `from_rgb`."""
+        image = read_picture(path)
+        return cls.from_rgb(image, depth=depth, wavelengths=wavelengths, illuminant=illuminant, luminance=luminance)
+
+    @classmethod
+    def builtin(
+        cls,
+        name: str,
+        size: int | tuple[int, int] | None = None,
+        *,
+        wavelengths: Tensor | None = None,
+        illuminant: str | Tensor = "D65",
+        luminance: float = 1000.0,
+    ) -> Scene:
+        """A scene that needs no file and no network, at 2 m, in float32.
+
+        - motorcycle: 500 x 741 with true depth, 2.1 to 5.0 m (Middlebury stereo, Scharstein et al. 2014)
+        - astronaut 512 x 512, coffee 400 x 600, chelsea (a cat) 300 x 451: photographs
+        - colour_chart: the 24 patches of the ColorChecker with their measured reflectances, 400 x 600
+        - star: a Siemens star of 36 periods, black on white, 512 x 512
+        - point_grid: points of light, one pixel each, 30 times as bright as white, 64 pixels apart on black, 512 x 512
+
+        Args:      size: the longer side [pixels]; or (height, width), for which a photograph is cropped in its middle.
+                   Charts are drawn at that size, photographs resized in linear light.
+                   Others: as for `Scene`.
+        Raises:    ValueError for an unknown name or a size below 1.
+        """
+        if name not in BUILTIN:
+            raise ValueError(f"unknown scene {name!r}. There are: {', '.join(BUILTIN)}; or use Scene.from_file(path).")
+        grid = wavelength_grid(wavelengths)
+        light = spectral.illuminant(illuminant, wavelengths=grid)
+        if name in PHOTOGRAPHS:
+            picture, depth = PHOTOGRAPHS[name]()
+            image = torch.tensor(picture).permute(2, 0, 1) / 255
+            scene = cls.from_rgb(image, depth=depth, wavelengths=grid, illuminant=light, luminance=luminance)
+            return _resized(scene, _target_shape(size, scene.shape[1:]))
+        draw, shape = CHARTS[name]
+        planes, reflectance = draw(*_target_shape(size, shape), grid)
+        return cls(planes, reflectance * light, grid, illuminant=light, luminance=luminance)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(B, H, W)."""
+        batch, _, height, width = self.coefficients.shape
+        return batch, height, width
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the coefficients."""
+        return self.coefficients.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of the coefficients."""
+        return self.coefficients.device
+
+    def bands(self) -> Tensor:
+        """The whole cube of relative radiance, (B,L,H,W): 1.3 GB for 12 megapixels in 28 bands of float32."""
+        if self.spectra is None:
+            return self.coefficients
+        return torch.einsum("bkhw,kl->blhw", self.coefficients, self.spectra)
+
+    def xyz(self) -> Tensor:
+        """The scene's colours, (B,3,H,W) CIE XYZ; `luminance` * Y is in cd/m^2. The cube is not formed."""
+        weights = spectral.xyz_weights(self.wavelengths).to(self.coefficients)
+        if self.spectra is not None:
+            weights = self.spectra @ weights
+        return torch.einsum("bkhw,kc->bchw", self.coefficients, weights)
+
+    def to_srgb(self) -> Tensor:
+        """The picture that an ideal camera without lens would take, (B,3,H,W) sRGB clipped to [0,1], for looking at."""
+        return linear_rgb_to_rgb(spectral.xyz_to_linear_srgb(self.xyz()).clamp(0, 1))
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Scene:
+        """The scene on another device or in another floating-point type. What is kept as float64 stays so."""
+        return replace(self, coefficients=self.coefficients.to(device=device, dtype=dtype))
+
+    def with_depth(self, depth: float | Tensor) -> Scene:
+        """The same scene at other distances [m]."""
+        return replace(self, depth=depth)
+
+    def crop(self, *, top: int, left: int, height: int, width: int) -> Scene:
+        """A window of the scene, `height` x `width` pixels. Raises: ValueError unless it lies inside."""
+        _, full_height, full_width = self.shape
+        if not (0 <= top < top + height <= full_height and 0 <= left < left + width <= full_width):
+            raise ValueError(
+                f"a window of {height} x {width} at row {top}, column {left} is not inside the scene's "
+                f"{full_height} x {full_width} pixels."
+            )
+        window = (..., slice(top, top + height), slice(left, left + width))
+        depth = self.depth[window] if isinstance(self.depth, Tensor) else self.depth
+        return replace(self, coefficients=self.coefficients[window], depth=depth)
+
+    def __repr__(self) -> str:
+        batch, height, width = self.shape
+        factors = "" if self.spectra is None else f"{len(self.spectra)} factors x "
+        low, high = self.wavelengths.min() * 1e9, self.wavelengths.max() * 1e9
+        depth = "depth map"
+        if isinstance(self.depth, float):
+            depth = f"depth {self.depth:g} m"
+        elif self.depth.numel():
+            depth = "depth {:.3g}..{:.3g} m".format(*(value.item() for value in self.depth.detach().aminmax()))
+        return (
+            f"Scene({batch} x {height} x {width}, {factors}{len(self.wavelengths)} bands {low:.0f}..{high:.0f} nm, "
+            f"{depth}, {self.luminance:g} cd/m^2, {self.dtype}, {self.device})"
+        )
+
+
+def read_picture(path: str | os.PathLike[str]) -> Tensor:
+    """Read a picture of 8 or 16 bits as it is meant to be seen: (3,H,W) float32 sRGB in [0,1], (1,H,W) if it is grey.
+
+    It is turned as its EXIF orientation says. What is transparent is laid on white. Its values are taken as sRGB: an
+    embedded colour profile is not read.
+
+    Raises:    FileNotFoundError; ValueError for a file that is no picture, damaged or cut short, or holds floats.
+    """
+    from kornia.io import ImageLoadType, load_image
+    from PIL import Image
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
+    try:
+        with Image.open(path) as file:
+            if file.format in ("PNG", "TIFF") and ";16" in str(file.tile):
+                # Pillow would cut 16-bit colours to 8 bits; Kornia keeps them, but knows fewer formats.
+                pixels = load_image(path, ImageLoadType.UNCHANGED).float() / 65535
+            elif file.mode in ("F", "I"):
+                raise ValueError("it holds 32-bit values. For linear radiance use Scene.from_bands")
+            else:
+                mode = ("L" if file.mode in ("1", "L", "LA") else "RGB") + "A" * file.has_transparency_data
+                pixels = torch.tensor(np.atleast_3d(np.asarray(file.convert(mode)))).permute(2, 0, 1) / 255
+            orientation = file.getexif().get(0x0112, 1)  # after decoding: Pillow has turned a TIFF by then
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"cannot read {path} as a picture of 8 or 16 bits: {error}.") from error
+    if len(pixels) in (2, 4):
+        pixels, alpha = pixels[:-1], pixels[-1:]
+        pixels = pixels * alpha + (1 - alpha)
+    if orientation in (5, 6, 7, 8):
+        pixels = pixels.transpose(1, 2)
+    flips = [axis for axis, cases in ((1, (3, 4, 7, 8)), (2, (2, 3, 6, 7))) if orientation in cases]
+    return pixels.flip(flips)
+
+
+def _describe(value: object) -> str:
+    """What was given instead of a floating-point tensor, and the way out."""
+    if isinstance(value, Tensor):
+        scale = {torch.uint8: "255", torch.uint16: "65535"}.get(value.dtype)
+        fix = f". Use .float() / {scale}" if scale else ". Use .float()" if not value.is_floating_point() else ""
+        return f"a tensor {tuple(value.shape)} of {value.dtype}{fix}"
+    if isinstance(value, np.ndarray):
+        order = ".permute(2, 0, 1)" if value.ndim == 3 and value.shape[-1] in (1, 3, 4) else ""
+        scale = {"uint8": " / 255", "uint16": ".float() / 65535"}.get(value.dtype.name, ".float()")
+        return f"an array {value.shape} of {value.dtype}. Use torch.from_numpy(image){order}{scale}"
+    return f"{type(value).__name__}"
+
+
+def _check_radiance(planes: Tensor, spectra: Tensor | None) -> None:
+    if not planes.numel():
+        return
+    low, high = (value.item() for value in planes.detach().aminmax())
+    if spectra is not None:
+        low, high = _product_range(planes.detach(), spectra.detach(), low, high)
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise ValueError(f"the radiance runs from {low:g} to {high:g}, expected finite values. Remove NaN and inf.")
+    # A factored cube may dip below zero by the error of its factorisation: a thousandth of the brightest is let pass.
+    if low < (0 if spectra is None else -1e-3 * high):
+        raise ValueError(f"the radiance goes down to {low:g}, but light is not negative. Use .clamp(min=0).")
+
+
+def _product_range(planes: Tensor, spectra: Tensor, low: float, high: float) -> tuple[float, float]:
+    """Lowest and highest radiance of a factored scene; bounds where no factor is negative, which are cheap."""
+    lowest, highest = (value.item() for value in spectra.aminmax())
+    if (low >= 0 and lowest >= 0) or not np.isfinite([low, high, lowest, highest]).all():
+        return low * lowest, high * highest
+    ranges = [torch.einsum("bkhw,k->bhw", planes, spectrum).aminmax() for spectrum in spectra.T]
+    return min(pair.min.item() for pair in ranges), max(pair.max.item() for pair in ranges)
+
+
+def _depth_map(depth: float | Tensor, planes: Tensor) -> float | Tensor:
+    """A float, or a map (B,1,H,W) like the planes; a lone number that requires grad becomes a map of it."""
+    if not isinstance(depth, (int, float, np.number, np.ndarray, Tensor)):
+        raise TypeError(
+            f"depth must be a number of metres or a tensor (B,1,H,W), got {type(depth).__name__} {depth!r}."
+        )
+    values = depth if isinstance(depth, Tensor) else torch.as_tensor(depth, dtype=torch.float64)
+    if not (values > 0).all():
+        check_distances(values, name="depth")
+    if values.ndim == 0 and not values.requires_grad:
+        return float(values)
+    batch, _, height, width = planes.shape
+    if values.ndim and values.shape not in ((height, width), (1, 1, height, width), (batch, 1, height, width)):
+        raise ValueError(
+            f"depth has shape {tuple(values.shape)}, expected a number, ({height}, {width}) or "
+            f"({batch}, 1, {height}, {width}), as the picture."
+        )
+    return values.to(planes).expand(batch, 1, height, width)
+
+
+def _target_shape(size: int | tuple[int, int] | None, shape: tuple[int, int]) -> tuple[int, int]:
+    if size is None:
+        return shape
+    height, width = shape
+    match size:
+        case int() if size >= 1:
+            return max(1, round(size * height / max(shape))), max(1, round(size * width / max(shape)))
+        case (int(height), int(width)) if height >= 1 and width >= 1:
+            return height, width
+    raise ValueError(f"size must be a number of pixels >= 1, or (height, width), got {size!r}.")
+
+
+def _resized(scene: Scene, shape: tuple[int, int]) -> Scene:
+    """Cropped in the middle to the proportions of `shape`, then resized: colours filtered, distances picked."""
+    _, height, width = scene.shape
+    if (height, width) == shape:
+        return scene
+    scale = max(shape[0] / height, shape[1] / width)
+    window = (max(1, min(height, round(shape[0] / scale))), max(1, min(width, round(shape[1] / scale))))
+    scene = scene.crop(top=(height - window[0]) // 2, left=(width - window[1]) // 2, height=window[0], width=window[1])
+    planes = F.interpolate(scene.coefficients, shape, mode="bilinear", antialias=True)
+    depth = scene.depth
+    if isinstance(depth, Tensor):
+        depth = F.interpolate(depth, shape, mode="nearest-exact")
+    return replace(scene, coefficients=planes, depth=depth)
+
+
+def _photograph(name: str) -> Callable[[], tuple[np.ndarray, float | Tensor]]:
+    def read() -> tuple[np.ndarray, float | Tensor]:
+        from skimage import data
+
+        return getattr(data, name)(), 2.0
+
+    return read
+
+
+def _motorcycle() -> tuple[np.ndarray, float | Tensor]:
+    """The left picture, and Z = f b / (d + doffs) with the calibration in scikit-image's docstring.
+
+    The 7 % of the pixels that have no disparity are mostly hidden from the right camera, so they belong to what is
+    behind: they take the farther one of the nearest valid distances to their left and right.
+    """
+    from skimage import data
+
+    picture, _, disparity = data.stereo_motorcycle()
+    focal_length, baseline, offset = 994.978, 0.193001, 31.086  # pixels, m, pixels
+    valid = np.isfinite(disparity)
+    width = disparity.shape[1]
+    column = np.arange(width)
+    before = np.maximum.accumulate(np.where(valid, column, -1), axis=1)
+    after = np.minimum.accumulate(np.where(valid, column, width)[:, ::-1], axis=1)[:, ::-1]
+    padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.inf)  # beyond the borders: nearer than anything
+    disparity = np.minimum(*(np.take_along_axis(padded, index + 1, axis=1) for index in (before, after)))
+    return picture, torch.tensor(focal_length * baseline / (disparity + offset))
+
+
+def _colour_chart(height: int, width: int, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Four rows of six patches in a black frame: a plane and a reflectance for each patch."""
+    row, row_place = np.divmod((np.arange(height) + 0.5) * 4 / height, 1)
+    column, column_place = np.divmod((np.arange(width) + 0.5) * 6 / width, 1)
+    frame = (np.abs(row_place - 0.5) > 0.42)[:, None] | (np.abs(column_place - 0.5) > 0.42)
+    patch = torch.tensor(np.where(frame, 24, row[:, None] * 6 + column))
+    planes = (patch == torch.arange(25)[:, None, None]).float()
+    black = planes[23] + 0.3 * planes[24]  # the frame is darker than the black patch, so that this one shows
+    return torch.cat([planes[:23], black[None]])[None], spectral.reflectances(wavelengths)
+
+
+def _star(height: int, width: int, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    samples = 4
+    y = (torch.arange(height * samples) + 0.5) / samples - height / 2
+    x = (torch.arange(width * samples) + 0.5) / samples - width / 2
+    angle, radius = torch.atan2(y[:, None], x), torch.hypot(y[:, None], x)
+    white = (torch.sin(36 * angle) >= 0) | (radius > 0.48 * min(height, width))
+    return F.avg_pool2d(white.float()[None, None], samples), torch.ones(1, len(wavelengths))
+
+
+def _point_grid(height: int, width: int, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    pitch = min(64, height, width)
+    planes = torch.zeros(1, 1, height, width)
+    planes[..., pitch // 2 :: pitch, pitch // 2 :: pitch] = 30.0
+    return planes, torch.ones(1, len(wavelengths))
+
+
+PHOTOGRAPHS: dict[str, Callable[[], tuple[np.ndarray, float | Tensor]]] = {
+    "motorcycle": _motorcycle,
+    "astronaut": _photograph("astronaut"),
+    "coffee": _photograph("coffee"),
+    "chelsea": _photograph("chelsea"),
+}
+"""Name -> a function that gives the picture (H,W,3) in 8 bits, and the depth."""
+
+CHARTS: dict[str, tuple[Callable[[int, int, Tensor], tuple[Tensor, Tensor]], tuple[int, int]]] = {
+    "colour_chart": (_colour_chart, (400, 600)),
+    "star": (_star, (512, 512)),
+    "point_grid": (_point_grid, (512, 512)),
+}
+"""Name -> a function of height, width and wavelengths that draws planes (1,K,H,W) and reflectances (K,L); a shape."""
+
+BUILTIN = (*PHOTOGRAPHS, *CHARTS)
+"""The scenes that `Scene.builtin` knows."""

@@ -1,0 +1,74 @@
+"""The analogue-to-digital converter: gain, black level, clipping and steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcam.context import Context, Stage
+from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.ste import clip_ste, round_ste
+from kcam.units import check_positive
+
+
+@in_float32
+def quantise(signal: Tensor, *, bits: int, black_level: Tensor | float = 0.0, gain: Tensor | float = 1.0) -> Tensor:
+    """Convert a voltage to one of 2^bits numbers.
+
+    y = round_ste( (2^bits - 1) clip_ste(gain signal + black_level / (2^bits - 1), 0, 1) ) / (2^bits - 1)
+
+    in this order: amplify, add the black level, clip, round. The gradient is `gain` inside the range, whatever the
+    rounding, and that of `clip_ste` outside.
+
+    Args:      signal: any shape, 1.0 = full well.  bits: 1..24, the steps that float32 can hold.
+               black_level: the number that no light gives [DN].  gain: analogue gain, 1 at base ISO.
+    Returns:   same shape, 1.0 = full scale (2^bits - 1 DN).
+    Valid when the dtype holds the steps: float16 has 11 bits, bfloat16 8, and is given back with those.
+    """
+    top = 2**bits - 1
+    level = clip_ste(signal * like(gain, signal) + like(black_level, signal) / top, 0.0, 1.0)
+    return round_ste(level * top) / top
+
+
+class ADC(Stage):
+    """The analogue-to-digital converter: `quantise`. Before it 1.0 is the full well, after it full scale.
+
+    The overall system gain of EMVA 1288 is K = gain (2^bits - 1) / full_well [DN / electron].
+
+    Args:      bits: 1..24.  black_level: the number that no light gives, 0 <= black_level < 2^bits - 1 [DN].
+               gain: analogue gain, > 0; None to take it from the context (ISO / 100).
+    Raises:    TypeError for bits that are no integer; ValueError for a value out of range.
+    """
+
+    bits: int
+    black_level: Tensor | float
+    gain: Tensor | float | None
+
+    def __init__(self, bits: int = 12, *, black_level: Tensor | float = 0.0, gain: Tensor | float | None = None):
+        super().__init__()
+        if isinstance(bits, bool) or not isinstance(bits, int):
+            raise TypeError(f"bits must be an integer such as 12, got {bits!r}.")
+        if not 1 <= bits <= 24:
+            raise ValueError(f"bits {bits} is outside 1..24; float32 holds no finer steps than 24 bits.")
+        check_not_negative(black_level, name="black_level", unit="DN")
+        highest = torch.as_tensor(black_level).detach().max().item()
+        if highest >= 2**bits - 1:
+            raise ValueError(
+                f"black_level {highest:g} DN leaves no range: expected less than full scale, "
+                f"{2**bits - 1} DN at {bits} bits. Black levels are in DN, not in shares of full scale."
+            )
+        if gain is not None:
+            check_positive(gain, name="gain", unit="(1 at base ISO)")
+        hold(self, bits=bits, black_level=black_level, gain=gain)
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,C,H,W) to the same shape: see `quantise`."""
+        gain = (context or Context()).gain if self.gain is None else self.gain
+        return quantise(signal, bits=self.bits, black_level=self.black_level, gain=gain)
+
+    def provides(self) -> dict[str, Any]:
+        """The black level as a share of full scale, and the gain where it was given."""
+        fields: dict[str, Any] = {"black_level": self.black_level / (2**self.bits - 1)}
+        return fields if self.gain is None else {**fields, "gain": self.gain}

@@ -1,0 +1,314 @@
+"""Colour filters as sums of Gaussians: fitted curves, and the tile that learns.
+
+kappa(lambda) = sum_i alpha_i N(lambda; mu_i, sigma),   i = 1..12                                     (thesis, eq. 3.9)
+
+with centres mu_i equally spaced over 420..720 nm and one common sigma. Wavelengths are counted in units of that
+spacing, Delta = 300 / 11 nm, so N = Delta / (sigma sqrt(2 pi)) exp(-(lambda - mu_i)^2 / 2 sigma^2): the twelve then add
+up to about 1, and alpha_i is about the curve's own value near mu_i.
+
+A curve is a response per unit *energy* (irradiance, not photons), with the peak of green at 1.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from kcam import spectral
+from kcam.context import Context, Stage
+from kcam.sensor.mosaic import pattern_tile
+from kcam.sensor.noise import hold
+from kcam.units import nm, wavelength_grid
+
+BASIS_SIZE = 12
+SPACING = 300 * nm / (BASIS_SIZE - 1)
+
+REFERENCE_BANDWIDTH = 100 * nm
+"""A filter of response 1 over this width turns an equal-energy white of 1 into a signal of 1."""
+
+INFRARED_EDGE = 8 * nm
+"""Scale of the infrared cut: its transmission falls from 90 to 10 % over 4.4 times this, 35 nm."""
+
+SHARPNESS = 10.0
+"""Of the learned tile's softplus: alpha = softplus(10 x) / 10 is about x above 0.2, and its slope at 0.01 is 0.1."""
+
+LEAST_ALPHA = 0.01
+"""What a learned tile starts from where the curve is 0."""
+
+
+def gaussian_basis(wavelengths: Tensor, *, width: float = 18 * nm) -> Tensor:
+    """The twelve Gaussians of eq. 3.9 at the given wavelengths, in units of their spacing.
+
+    Args:      wavelengths: (L,) [m].  width: common standard deviation sigma [m].
+    Returns:   (12, L) float64; for sigma from 13 nm they add up to 1 within 3 % between 455 and 685 nm.
+    """
+    centres = torch.linspace(420, 720, BASIS_SIZE, dtype=torch.float64, device=wavelengths.device) * nm
+    distance = (wavelengths.double() - centres[:, None]) / width
+    return SPACING / (width * math.sqrt(2 * math.pi)) * torch.exp(-0.5 * distance**2)
+
+
+def infrared_transmission(wavelengths: Tensor, *, edge: Tensor | float) -> Tensor:
+    """A smooth infrared cut filter: T = 1 / (1 + exp((lambda - edge) / 8 nm)), half transmission at `edge` [m]."""
+    return torch.sigmoid((edge - wavelengths) / INFRARED_EDGE)
+
+
+class GaussianFit(NamedTuple):
+    """Curves as sums of Gaussians: coefficients (C,12) >= 0, the common width [m], and the RMS error of each curve."""
+
+    coefficients: Tensor
+    width: float
+    errors: tuple[float, ...]
+
+
+def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
+    """Write curves as non-negative sums of the twelve Gaussians, with the common width that suits them best.
+
+    minimise over sigma = 13..30 nm and alpha >= 0:   sum over channels and wavelengths of (kappa - curve)^2
+
+    Args:      curves: (C, L).  wavelengths: (L,), equally spaced [m].
+    Returns:   coefficients in float64, scaled so that green (channel 1, or the only one) peaks at exactly 1.
+    Source:    Lawson and Hanson, Solving Least Squares Problems (1974), chapter 23: NNLS, as in scipy.
+    """
+    from scipy.optimize import nnls  # comes with scikit-image; imported late, since few users need it
+
+    def fit(width: float) -> GaussianFit:
+        basis = gaussian_basis(wavelengths, width=width)
+        alpha = torch.stack([torch.from_numpy(nnls(basis.T.numpy(), curve)[0]) for curve in curves.double().numpy()])
+        alpha = alpha / (alpha @ basis)[min(1, len(curves) - 1)].max()
+        return GaussianFit(alpha, width, tuple((alpha @ basis - curves).square().mean(1).sqrt().tolist()))
+
+    return min((fit(width * nm) for width in range(13, 31)), key=lambda result: math.hypot(*result.errors))
+
+
+@functools.cache
+def fitted(name: str) -> GaussianFit:
+    """The fit to a named curve of `spectral.sensitivity`, over 400..740 nm in steps of 1 nm."""
+    grid = torch.arange(400, 741, dtype=torch.float64) * nm
+    return fit_gaussians(spectral.sensitivity(name, wavelengths=grid), wavelengths=grid)
+
+
+class ColourFilter(Stage):
+    """The spectral response of the sensor's pixels: bands to colour channels.
+
+    channel_c = sum_l kappa_c(lambda_l) (width_l / 100 nm) bands_l
+
+    with the bands' widths from `spectral.band_widths` and a constant reference of 100 nm, so that scaling the
+    coefficients scales the signal. Two forms, by the shape of the coefficients:
+
+    - curves (C,12): C = 3 for red, green, blue, 4 with white, 1 for a monochrome sensor; (B,L,H,W) to (B,C,H,W).
+    - a tile (t,t,12): one curve per pixel, repeated over the sensor from its top left corner (eq. 3.9); (B,L,H,W) to
+      the mosaiced plane (B,1,H,W). No Mosaic follows it.
+
+    Args:      coefficients: alpha >= 0, or with `softplus` unconstrained values x with alpha = softplus(10 x) / 10.
+                   An nn.Parameter trains; without `softplus` nothing but the start keeps it from going negative.
+               softplus: whether the coefficients pass through the softplus, so that alpha > 0 whatever is learnt.
+               width: common standard deviation sigma of the Gaussians [m].
+               infrared_cut: wavelength of half transmission of an infrared cut filter [m], see
+                   `infrared_transmission`; None for no cut beyond what the curves themselves hold.
+    Raises:    ValueError for coefficients of another shape, negative or not finite, or a length out of range;
+               TypeError for coefficients that are no floating-point tensor.
+    """
+
+    coefficients: Tensor
+    softplus: bool
+    width: float
+    infrared_cut: Tensor | float | None
+
+    def __init__(
+        self,
+        coefficients: Tensor,
+        *,
+        softplus: bool = False,
+        width: float = 18 * nm,
+        infrared_cut: Tensor | float | None = None,
+    ):
+        super().__init__()
+        if not (isinstance(coefficients, Tensor) and coefficients.is_floating_point()):
+            raise TypeError(f"coefficients must be a floating-point tensor, got {_describe(coefficients)}.")
+        if coefficients.ndim not in (2, 3) or coefficients.shape[-1] != BASIS_SIZE or coefficients.numel() == 0:
+            raise ValueError(
+                f"coefficients must be curves (C, {BASIS_SIZE}) or a tile (t, t, {BASIS_SIZE}), one value per "
+                f"Gaussian, got shape {tuple(coefficients.shape)}."
+            )
+        if not coefficients.isfinite().all() or (not softplus and (coefficients < 0).any()):
+            raise ValueError(
+                f"coefficients must be finite{'' if softplus else ' and >= 0'}: light is absorbed, never negative. "
+                f"Got values from {coefficients.min().item():g} to {coefficients.max().item():g}; "
+                "clamp them, or pass softplus=True for unconstrained ones."
+            )
+        if not 1 * nm <= width <= 1000 * nm:
+            raise ValueError(
+                f"width {width:g} is outside 1e-9..1e-6 m. Widths are in metres; did you mean {width:g} * nm?"
+            )
+        if infrared_cut is not None:
+            wavelength_grid(torch.as_tensor(infrared_cut))
+        hold(self, coefficients=coefficients, softplus=softplus, width=width, infrared_cut=infrared_cut)
+
+    @classmethod
+    def kodak(cls, *, infrared_cut: float | None = None) -> ColourFilter:
+        """Red, green and blue of a Kodak colour sensor, after a smooth approximation (see `spectral.sensitivity`).
+
+        The fit errs by 1.5, 0.5 and 0.4 % RMS of green's peak. The curves hold no infrared cut: a camera that is to
+        see as the eye does adds one, such as ``infrared_cut=650 * nm``.
+        """
+        return cls._fitted("kodak", infrared_cut)
+
+    @classmethod
+    def nikon(cls, *, infrared_cut: float | None = None) -> ColourFilter:
+        """The measured Nikon 5100, its infrared cut included.
+
+        Its steep edges are beyond twelve Gaussians: the fit errs by 6.8, 1.6 and 4.9 % RMS, by 25 % at the red edge.
+        """
+        return cls._fitted("nikon_5100", infrared_cut)
+
+    @classmethod
+    def sigma(cls, *, infrared_cut: float | None = None) -> ColourFilter:
+        """The measured Sigma SD Merrill, whose three broad curves come from stacked photodiodes, with its infrared cut.
+
+        The fit errs by 3.7, 3.0 and 2.4 % RMS, by 24 % at the edge of the cut.
+        """
+        return cls._fitted("sigma_sd_merrill", infrared_cut)
+
+    @classmethod
+    def rgbw(cls, *, infrared_cut: float | None = None) -> ColourFilter:
+        """The Kodak curves and a clear fourth one, for Mosaic("rgbw").
+
+        White is an approximation, not a measurement: 1.2 times a Gaussian around 570 nm of sigma 140 nm, the shape of
+        bare silicon per unit energy, above the three coloured curves. Under daylight a white pixel fills 2.9 times as
+        fast as a green one, so expose for it: ``Exposure(0.27)`` brings a perfect white to 0.8 of its well.
+        """
+        fit = fitted("kodak")
+        centres = torch.linspace(420, 720, BASIS_SIZE, dtype=torch.float64)
+        clear = 1.2 * torch.exp(-0.5 * ((centres - 570) / 140) ** 2)
+        coefficients = torch.cat([fit.coefficients, clear[None]])
+        return cls(coefficients.float(), width=fit.width, infrared_cut=infrared_cut)
+
+    @classmethod
+    def learned(cls, tile: int = 28, *, infrared_cut: float | None = None) -> ColourFilter:
+        """The trainable tile of eq. 3.9, non-negative by softplus, which starts as the Kodak curves in RGGB order.
+
+        Args:      tile: side of the tile, >= 1 [pixels]; an even one continues the RGGB pattern without a seam.
+        Raises:    TypeError or ValueError for a side that is no integer >= 1.
+        """
+        if isinstance(tile, bool) or not isinstance(tile, int):
+            raise TypeError(f"tile must be a whole number of pixels such as 28, got {tile!r}.")
+        if tile < 1:
+            raise ValueError(f"tile must be >= 1 pixel, got {tile}.")
+        fit = fitted("kodak")
+        index = torch.arange(tile) % 2
+        alpha = fit.coefficients[pattern_tile("RGGB")[index[:, None], index]]
+        alpha = alpha.clamp(min=LEAST_ALPHA)  # at 0 the softplus has no inverse, and near it no slope to learn by
+        raw = alpha + torch.log(-torch.expm1(-SHARPNESS * alpha)) / SHARPNESS
+        return cls(nn.Parameter(raw.float()), softplus=True, width=fit.width, infrared_cut=infrared_cut)
+
+    @classmethod
+    def _fitted(cls, name: str, infrared_cut: float | None) -> ColourFilter:
+        fit = fitted(name)
+        return cls(fit.coefficients.float(), width=fit.width, infrared_cut=infrared_cut)
+
+    @property
+    def is_tile(self) -> bool:
+        """Whether each pixel of a tile has its own curve, so that `forward` gives the mosaiced plane."""
+        return self.coefficients.ndim == 3
+
+    def alpha(self) -> Tensor:
+        """The weights of the Gaussians, (C,12) or (t,t,12), >= 0."""
+        return F.softplus(self.coefficients, beta=SHARPNESS) if self.softplus else self.coefficients
+
+    def basis(self, wavelengths: Tensor) -> Tensor:
+        """The Gaussians behind the infrared cut, (12,L) float64."""
+        grid = wavelength_grid(wavelengths).to(self.coefficients.device)
+        basis = gaussian_basis(grid, width=self.width)
+        if self.infrared_cut is not None:
+            basis = basis * infrared_transmission(grid, edge=self.infrared_cut)
+        return basis
+
+    def response(self, wavelengths: Tensor) -> Tensor:
+        """The curves kappa, per unit energy, (C,L) float64; of a tile the mean curve over its pixels, (1,L)."""
+        alpha = self.alpha().double()
+        return (alpha.mean((0, 1))[None] if self.is_tile else alpha) @ self.basis(wavelengths)
+
+    def white(self, wavelengths: Tensor, *, illuminant: Tensor | None = None) -> Tensor:
+        """The channels of a perfect white, (C,) float64: of the curves, or of the tile's mean curve, (1,).
+
+        Args:      wavelengths: (L,) [m].  illuminant: (L,) relative spectral power; None for D65.
+        Raises:    ValueError if their lengths differ.
+        """
+        if illuminant is None:
+            illuminant = spectral.illuminant("D65", wavelengths=wavelengths)
+        _check_bands(len(illuminant), wavelengths, "the illuminant has")
+        response = self.response(wavelengths)
+        return response @ (illuminant.double().cpu() * _shares(wavelengths)).to(response.device)
+
+    def contraction(self, wavelengths: Tensor) -> Tensor:
+        """The weights over the bands, widths included: what an Imaging stage absorbs.
+
+        forward(bands) = finish(sum_l contraction[k, l] bands[:, l])
+
+        Returns:   (K,L) float64, K = C for curves and 12 for a tile, whose coefficients are applied by `finish`.
+        """
+        basis = self.basis(wavelengths) * _shares(wavelengths).to(self.coefficients.device)
+        return basis if self.is_tile else self.alpha().double() @ basis
+
+    def finish(self, planes: Tensor) -> Tensor:
+        """What is left to do after the contraction: nothing for curves; for a tile each pixel's sum of its Gaussians.
+
+        Args:      planes: (..., K, H, W), K as in `contraction`; any H and W.
+        Returns:   (..., C, H, W), for a tile (..., 1, H, W).
+        Raises:    ValueError for another number of planes.
+        """
+        alpha = self.alpha()
+        count = BASIS_SIZE if self.is_tile else alpha.shape[0]
+        if planes.ndim < 3 or planes.shape[-3] != count:
+            raise ValueError(
+                f"finish expects the {count} planes of the contraction, (..., {count}, H, W), "
+                f"got shape {tuple(planes.shape)}."
+            )
+        if not self.is_tile:
+            return planes
+        height, width = planes.shape[-2:]
+        rows, columns, _ = alpha.shape
+        sensor = alpha.to(planes).permute(2, 0, 1).repeat(1, -(-height // rows), -(-width // columns))
+        return (planes * sensor[:, :height, :width]).sum(-3, keepdim=True)
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """Bands (B,L,H,W) at the context's wavelengths to channels (B,C,H,W), or to the tile's plane (B,1,H,W).
+
+        Raises:    ValueError if the number of bands is not that of the wavelengths.
+        """
+        wavelengths = (context or Context()).wavelengths
+        if signal.ndim < 3:
+            raise ValueError(f"expected bands (..., L, H, W), got shape {tuple(signal.shape)}.")
+        _check_bands(signal.shape[-3], wavelengths, "the signal has")
+        weights = self.contraction(wavelengths).to(signal)
+        return self.finish(torch.einsum("kl,...lhw->...khw", weights, signal))
+
+    def provides(self) -> dict[str, ColourFilter]:
+        """Itself, for exposure, white balance and colour matrix."""
+        return {"colour_filter": self}
+
+    def extra_repr(self) -> str:
+        """The shape of the coefficients and the cut."""
+        cut = "" if self.infrared_cut is None else f", infrared_cut={torch.as_tensor(self.infrared_cut).item():g}"
+        return f"{tuple(self.coefficients.shape)}, softplus={self.softplus}, width={self.width:g}{cut}"
+
+
+def _shares(wavelengths: Tensor) -> Tensor:
+    return spectral.band_widths(wavelengths) / REFERENCE_BANDWIDTH
+
+
+def _check_bands(bands: int, wavelengths: Tensor, subject: str) -> None:
+    if bands != len(wavelengths):
+        raise ValueError(
+            f"{subject} {bands} bands, but there are {len(wavelengths)} wavelengths; pass one wavelength per band, "
+            f"such as Context(wavelengths=torch.linspace(420, 720, {bands}) * nm)."
+        )
+
+
+def _describe(value: object) -> str:
+    return f"a tensor of {value.dtype}" if isinstance(value, Tensor) else type(value).__name__

@@ -1,0 +1,94 @@
+"""The colour filter array: which channel each pixel records."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcam.context import Context, Stage
+
+CHANNELS = "RGBW"
+
+
+def _tile(*rows: str) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(CHANNELS.index(letter) for letter in row) for row in rows)
+
+
+# One tile per pattern, as channel indices (R=0, G=1, B=2, W=3); its top left corner lies on the picture's.
+# A new pattern is a new row. Sources: Bayer, US 3 971 065; X-Trans as in LibRaw's table (US 8 531 563);
+# rgbw is Kodak's "Sparse" array of Compton and Hamilton, US 8 139 130.
+PATTERNS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "RGGB": _tile("RG", "GB"),
+    "GRBG": _tile("GR", "BG"),
+    "GBRG": _tile("GB", "RG"),
+    "BGGR": _tile("BG", "GR"),
+    "quad_bayer": _tile("RRGG", "RRGG", "GGBB", "GGBB"),
+    "x_trans": _tile("GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG"),
+    "rgbw": _tile("WBWG", "BWGW", "WGWR", "GWRW"),
+}
+
+
+def pattern_tile(pattern: str) -> Tensor:
+    """The repeating tile of a pattern as channel indices, (rows, columns) int64; ValueError for an unknown name."""
+    if pattern not in PATTERNS:
+        raise ValueError(f"pattern {pattern!r} is unknown; expected one of {', '.join(PATTERNS)}.")
+    return torch.tensor(PATTERNS[pattern])
+
+
+def channel_masks(pattern: str, height: int, width: int, *, device: torch.device | str | None = None) -> Tensor:
+    """Where each channel is recorded: one mask per channel of the pattern (3, or 4 with white).
+
+    Args:      pattern: a name in `PATTERNS`.  height, width: of the picture, >= 0 pixels, odd ones too.
+    Returns:   (C, height, width) bool; at every pixel exactly one channel is True.
+    Raises:    ValueError for an unknown pattern.
+    """
+    tile = pattern_tile(pattern).to(device)
+    channels = int(tile.max()) + 1
+    one_hot = tile == torch.arange(channels, device=tile.device)[:, None, None]
+    rows, columns = tile.shape
+    return one_hot.repeat(1, -(-height // rows), -(-width // columns))[:, :height, :width]
+
+
+def mosaic(signal: Tensor, *, pattern: str) -> Tensor:
+    """Keep at each pixel the one channel that the colour filter array lets through.
+
+    raw(y, x) = signal(channel(y mod rows, x mod columns), y, x)
+
+    Args:      signal: (..., C, H, W), C = 3, or 4 for "rgbw".  pattern: a name in `PATTERNS`.
+    Returns:   (..., 1, H, W), values unchanged; the gradient is 1 at the kept channel, 0 elsewhere.
+    Raises:    ValueError for an unknown pattern or another number of channels.
+    """
+    tile = pattern_tile(pattern)
+    channels = int(tile.max()) + 1
+    if signal.ndim < 3 or signal.shape[-3] != channels:
+        raise ValueError(
+            f"pattern {pattern!r} selects among {channels} channels ({', '.join(CHANNELS[:channels])}): expected "
+            f"(..., {channels}, H, W), got shape {tuple(signal.shape)}. Put a ColourFilter with {channels} curves "
+            "before it; a learned tile gives the mosaiced plane itself and takes no Mosaic."
+        )
+    masks = channel_masks(pattern, *signal.shape[-2:], device=signal.device)
+    raw = signal[..., 0, :, :]
+    for channel in range(1, channels):  # a selection, not a sum of products: an inf in one channel stays there
+        raw = torch.where(masks[channel], signal[..., channel, :, :], raw)
+    return raw.unsqueeze(-3)
+
+
+class Mosaic(Stage):
+    """The colour filter array as a stage: `mosaic` with a named pattern. Any height and width, odd ones too."""
+
+    def __init__(self, pattern: str = "RGGB"):
+        super().__init__()
+        pattern_tile(pattern)
+        self.pattern = pattern
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,C,H,W) to (B,1,H,W): see `mosaic`."""
+        return mosaic(signal, pattern=self.pattern)
+
+    def provides(self) -> dict[str, str]:
+        """The pattern, for the demosaic."""
+        return {"pattern": self.pattern}
+
+    def extra_repr(self) -> str:
+        """The pattern's name."""
+        return repr(self.pattern)

@@ -1,0 +1,414 @@
+"""From expected to recorded electrons: shot noise, dark current, fixed pattern and read noise, in EMVA 1288 terms.
+
+A signal of 1.0 is the full well; every stage counts in electrons inside, N = signal * full_well. The words are those
+of EMVA Standard 1288 (release 4.0):
+
+    full_well      saturation capacity, mu_e.sat [electrons]
+    K              overall system gain [DN / electron]; after an `ADC`, K = gain (2^bits - 1) / full_well
+    sigma_d        temporal dark noise [electrons]; `ReadNoise.sigma_electrons`
+    mu_I           dark current [electrons / s]; `DarkCurrent.electrons_per_second`
+    PRNU, DSNU     photo response and dark signal non-uniformity; `FixedPattern` [share of the signal, electrons]
+
+Together they give the photon transfer line, the variance of the recorded value against its mean:
+sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark), in DN^2.
+
+Every argument may be an `nn.Parameter` (it trains) or a tensor that broadcasts over (B,C,H,W) (a buffer), such as one
+value per picture, (B,1,1,1). float16 and bfloat16 signals are computed in float32, since a step of the former is
+5 electrons at a full well of 10 000, and given back in their own dtype.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcam.context import Context, Stage
+from kcam.ste import clip_ste
+from kcam.units import check_positive
+
+
+def hold(stage: nn.Module, **arguments: Any) -> None:
+    """Store a stage's arguments under their own names: a plain tensor as a buffer, everything else as it is."""
+    for name, value in arguments.items():
+        if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
+            stage.register_buffer(name, value)
+        else:
+            setattr(stage, name, value)
+
+
+def like(value: Tensor | float, signal: Tensor) -> Tensor | float:
+    """A number as it is; a tensor or parameter in the signal's dtype, on its device, with its gradient."""
+    return value.to(signal) if isinstance(value, Tensor) else value
+
+
+def check_not_negative(value: Tensor | float, *, name: str, unit: str) -> None:
+    """ValueError unless every element of `value` is finite and >= 0."""
+    values = torch.as_tensor(value).detach()
+    bad = ~((values >= 0) & values.isfinite())
+    if bad.any():
+        raise ValueError(f"{name} must be finite and >= 0 {unit}, got {values[bad].flatten()[0].item():g}.")
+
+
+def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Compute a function of a signal in at least float32 and give the result back in the signal's own dtype."""
+
+    @functools.wraps(function)
+    def wrapper(signal: Tensor, **arguments: Any) -> Tensor:
+        if not signal.is_floating_point():
+            raise TypeError(
+                f"expected a floating-point signal in which 1.0 is the full well, got {signal.dtype}; "
+                "divide by the largest value, such as image / 255."
+            )
+        working = signal.float() if signal.dtype in (torch.float16, torch.bfloat16) else signal
+        return function(working, **arguments).to(signal.dtype)
+
+    return wrapper
+
+
+class _Poisson(torch.autograd.Function):
+    @staticmethod
+    def forward(rate: Tensor, generator: torch.Generator | None) -> Tensor:
+        return torch.poisson(rate, generator=generator)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.save_for_backward(inputs[0], output)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        rate, count = ctx.saved_tensors
+        return grad * (1 + (count - rate) / (2 * rate.clamp(min=1))), None
+
+
+def poisson(electrons: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    """Count random independent arrivals: an exact Poisson draw, with a gradient to its expectation.
+
+    N ~ Poisson(lambda),   dN/d lambda := 1 + (N - lambda) / (2 max(lambda, 1))
+
+    It is the slope of lambda + sqrt(lambda) e at the e that gives this N, kept finite below one electron. Its mean is
+    exactly 1 at every lambda, so the gradient of any loss linear in N is unbiased.
+
+    Args:      electrons: expected number lambda >= 0, any shape, float32 or float64.
+               generator: source of the draw, on the device of `electrons`; None for torch's default one.
+    Returns:   whole numbers in the dtype of `electrons`.
+    """
+    return _Poisson.apply(electrons, generator)
+
+
+@in_float32
+def saturate(signal: Tensor) -> Tensor:
+    """Clip at the full well, 1.0, and at no light, 0, with the gradient of `clip_ste`."""
+    return clip_ste(signal, 0.0, 1.0)
+
+
+@in_float32
+def shot_noise(signal: Tensor, *, full_well: Tensor | float, generator: torch.Generator | None = None) -> Tensor:
+    """Turn expected into counted photoelectrons, and stop at the full well.
+
+    N ~ Poisson(signal full_well),   result = min(N, full_well) / full_well
+
+    Gradient: that of `poisson` times that of `clip_ste` at the well and at 0 (a negative signal counts as no light).
+
+    Args:      signal: expected electrons as a share of the full well.  full_well: saturation capacity [electrons].
+               generator: see `poisson`.
+    Returns:   counted electrons as a share of the full well, 0..1.
+    Source:    EMVA 1288 release 4.0, eq. (1): photon noise.
+    """
+    capacity = like(full_well, signal)
+    # A hundred full wells overflow with certainty: the result is the same, and an infinite rate could not be drawn.
+    rate = clip_ste(signal, 0.0, 100.0) * capacity
+    return clip_ste(poisson(rate, generator=generator) / capacity, None, 1.0)
+
+
+@in_float32
+def read_noise(
+    signal: Tensor,
+    *,
+    sigma_electrons: Tensor | float,
+    full_well: Tensor | float,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Add the Gaussian noise of the read-out.
+
+    result = signal + (sigma_d / full_well) e,   e ~ N(0, 1);   d result / d sigma_d = e / full_well
+
+    Args:      signal: share of the full well.  sigma_electrons: temporal dark noise sigma_d, >= 0 [electrons].
+               full_well: saturation capacity [electrons].  generator: see `poisson`.
+    Returns:   share of the full well, no longer bounded: the ADC clips it.
+    """
+    noise = torch.randn(signal.shape, generator=generator, dtype=signal.dtype, device=signal.device)
+    return signal + noise * (like(sigma_electrons, signal) / like(full_well, signal))
+
+
+def dark_electrons(
+    electrons_per_second: Tensor | float,
+    *,
+    time: Tensor | float,
+    temperature: Tensor | float | None = None,
+    reference_temperature: float = 25.0,
+    doubling_temperature: float = 8.0,
+) -> Tensor | float:
+    """Expected number of thermally generated electrons in one exposure.
+
+    mu_d = mu_I time 2^((temperature - reference) / doubling)
+
+    Args:      electrons_per_second: dark current mu_I at the reference temperature, >= 0 [electrons / s].
+               time: exposure [s].  temperature: of the sensor [degrees C]; None for the reference temperature.
+               doubling_temperature: rise that doubles the dark current, > 0 [K].
+    Returns:   expected electrons per pixel.
+    Source:    EMVA 1288 release 4.0, dark current and its doubling temperature. 8 K is typical of silicon.
+    """
+    mean = electrons_per_second * time
+    if temperature is not None:
+        mean = mean * 2 ** ((temperature - reference_temperature) / doubling_temperature)
+    return mean
+
+
+@in_float32
+def dark_current(
+    signal: Tensor,
+    *,
+    electrons: Tensor | float,
+    full_well: Tensor | float,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Add dark electrons, Poisson distributed, to the same well as the light's.
+
+    result = min(signal + N / full_well, 1),   N ~ Poisson(electrons);   gradients of `poisson` and `clip_ste`
+
+    Args:      signal: share of the full well.  electrons: expected dark electrons, see `dark_electrons`.
+               full_well: saturation capacity [electrons].  generator: see `poisson`.
+    Returns:   share of the full well, <= 1.
+    """
+    rate = torch.zeros_like(signal) + like(electrons, signal)
+    count = poisson(rate, generator=generator)
+    return clip_ste(signal + count / like(full_well, signal), None, 1.0)
+
+
+def fixed_pattern_fields(shape: tuple[int, ...], *, seed: int) -> Tensor:
+    """Standard normal gain and offset fields of one sensor, (2, *shape) float32 on the CPU, the same at every call."""
+    return torch.randn((2, *shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float32)
+
+
+@in_float32
+def fixed_pattern(
+    signal: Tensor, *, prnu: Tensor | float, dsnu: Tensor | float, full_well: Tensor | float, seed: int
+) -> Tensor:
+    """Give every pixel its own gain and offset, the same in every frame.
+
+    result = signal (1 + prnu g) + (dsnu / full_well) o,   g, o ~ N(0, 1) drawn once per sensor
+
+    Args:      signal: (..., C, H, W), share of the full well.  prnu: relative spread of the gain (0.01 is 1 %).
+               dsnu: spread of the offset [electrons].  full_well: saturation capacity [electrons].
+               seed: names the sensor: one seed and (C,H,W) give the same fields in every frame and on every device.
+    Returns:   share of the full well.
+    Source:    EMVA 1288 release 4.0, PRNU and DSNU (white, without its column and row parts).
+    """
+    gain, offset = fixed_pattern_fields(tuple(signal.shape[-3:]), seed=seed).to(signal)
+    return signal * (1 + like(prnu, signal) * gain) + offset * (like(dsnu, signal) / like(full_well, signal))
+
+
+class Mean(Stage):
+    """A random stage at its mean: it holds that stage, so parameters are shared, and calls its `expected`."""
+
+    def __init__(self, stage: RandomStage):
+        super().__init__()
+        self.stage = stage
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """The expected result of the stage."""
+        return self.stage.expected(signal, context)
+
+    def provides(self) -> dict[str, Any]:
+        """What the stage itself provides."""
+        return self.stage.provides()
+
+
+class RandomStage(Stage):
+    """A stage with noise. A subclass draws in `forward`, and gives its mean over all draws in `expected`."""
+
+    full_well: Tensor | float | None
+
+    def expected(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """The signal without the noise: by default unchanged (noise of zero mean)."""
+        return signal
+
+    def mean(self) -> Mean:
+        """The same stage at its mean, sharing parameters."""
+        return Mean(self)
+
+    def provides(self) -> dict[str, Any]:
+        """The full well, where it was given."""
+        return {} if self.full_well is None else {"full_well": self.full_well}
+
+    def _resolve(
+        self, context: Context | None, generator: torch.Generator | None
+    ) -> tuple[Tensor | float, torch.Generator | None]:
+        context = context or Context()
+        full_well = context.full_well if self.full_well is None else self.full_well
+        return full_well, context.generator if generator is None else generator
+
+
+class ShotNoise(RandomStage):
+    """Photon noise and saturation: `shot_noise`. Its mean is the signal clipped at the full well.
+
+    Args:      full_well: saturation capacity [electrons]; None to take it from the context (10 000).
+    Raises:    ValueError for a full well <= 0.
+    """
+
+    def __init__(self, full_well: Tensor | float | None = None):
+        super().__init__()
+        if full_well is not None:
+            check_positive(full_well, name="full_well", unit="electrons")
+        hold(self, full_well=full_well)
+
+    def forward(
+        self, signal: Tensor, context: Context | None = None, *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """(B,C,H,W) to the same shape: see `shot_noise`."""
+        full_well, generator = self._resolve(context, generator)
+        return shot_noise(signal, full_well=full_well, generator=generator)
+
+    def expected(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """The expected electrons, clipped at the full well.
+
+        The clip of the mean, not the mean of the clip: they differ by 0.4 sigma at the well itself, less elsewhere.
+        """
+        return saturate(signal)
+
+
+class ReadNoise(RandomStage):
+    """The noise of the read-out, EMVA's temporal dark noise sigma_d: `read_noise`. Its mean is the signal.
+
+    Args:      sigma_electrons: standard deviation, >= 0 [electrons].
+               full_well: saturation capacity [electrons]; None to take it from the context.
+    Raises:    ValueError for a negative sigma or a full well <= 0.
+    """
+
+    sigma_electrons: Tensor | float
+
+    def __init__(self, sigma_electrons: Tensor | float = 3.0, *, full_well: Tensor | float | None = None):
+        super().__init__()
+        check_not_negative(sigma_electrons, name="sigma_electrons", unit="electrons")
+        if full_well is not None:
+            check_positive(full_well, name="full_well", unit="electrons")
+        hold(self, sigma_electrons=sigma_electrons, full_well=full_well)
+
+    def forward(
+        self, signal: Tensor, context: Context | None = None, *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """(B,C,H,W) to the same shape: see `read_noise`."""
+        full_well, generator = self._resolve(context, generator)
+        return read_noise(signal, sigma_electrons=self.sigma_electrons, full_well=full_well, generator=generator)
+
+
+class DarkCurrent(RandomStage):
+    """Thermal electrons in every pixel: `dark_current`. Its mean adds their expected number.
+
+    It belongs after ShotNoise: before it, the dark electrons would be counted at random twice.
+
+    Args:      see `dark_electrons`; full_well: saturation capacity [electrons]; None to take it from the context.
+    Raises:    ValueError for a negative current or time, or a doubling temperature or full well <= 0.
+    """
+
+    electrons_per_second: Tensor | float
+    time: Tensor | float
+    temperature: Tensor | float | None
+    reference_temperature: float
+    doubling_temperature: float
+
+    def __init__(
+        self,
+        electrons_per_second: Tensor | float,
+        *,
+        time: Tensor | float,
+        temperature: Tensor | float | None = None,
+        reference_temperature: float = 25.0,
+        doubling_temperature: float = 8.0,
+        full_well: Tensor | float | None = None,
+    ):
+        super().__init__()
+        check_not_negative(electrons_per_second, name="electrons_per_second", unit="electrons / s")
+        check_not_negative(time, name="time", unit="s")
+        check_positive(doubling_temperature, name="doubling_temperature", unit="K")
+        if full_well is not None:
+            check_positive(full_well, name="full_well", unit="electrons")
+        hold(
+            self,
+            electrons_per_second=electrons_per_second,
+            time=time,
+            temperature=temperature,
+            reference_temperature=reference_temperature,
+            doubling_temperature=doubling_temperature,
+            full_well=full_well,
+        )
+
+    def electrons(self) -> Tensor | float:
+        """Expected dark electrons per pixel: see `dark_electrons`."""
+        return dark_electrons(
+            self.electrons_per_second,
+            time=self.time,
+            temperature=self.temperature,
+            reference_temperature=self.reference_temperature,
+            doubling_temperature=self.doubling_temperature,
+        )
+
+    def forward(
+        self, signal: Tensor, context: Context | None = None, *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """(B,C,H,W) to the same shape: see `dark_current`."""
+        full_well, generator = self._resolve(context, generator)
+        return dark_current(signal, electrons=self.electrons(), full_well=full_well, generator=generator)
+
+    def expected(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """The signal with the expected dark electrons, clipped at the full well."""
+        full_well, _ = self._resolve(context, None)
+        return _add_mean(signal, electrons=self.electrons(), full_well=full_well)
+
+
+@in_float32
+def _add_mean(signal: Tensor, *, electrons: Tensor | float, full_well: Tensor | float) -> Tensor:
+    return clip_ste(signal + like(electrons, signal) / like(full_well, signal), None, 1.0)
+
+
+class FixedPattern(RandomStage):
+    """Gain and offset errors of the pixels, EMVA's PRNU and DSNU, the same in every frame: `fixed_pattern`.
+
+    Its mean over sensors is the signal. After ShotNoise its offsets reach the picture whole; before it, negative ones
+    would be cut off in the dark.
+
+    Args:      prnu: relative spread of the gain, >= 0.  dsnu: spread of the offset, >= 0 [electrons].
+               seed: names the sensor, an integer.
+               full_well: saturation capacity [electrons]; None to take it from the context.
+    Raises:    ValueError for a negative spread or a full well <= 0; TypeError for a seed that is no integer.
+    """
+
+    prnu: Tensor | float
+    dsnu: Tensor | float
+    seed: int
+
+    def __init__(
+        self,
+        prnu: Tensor | float = 0.01,
+        *,
+        dsnu: Tensor | float = 2.0,
+        seed: int = 0,
+        full_well: Tensor | float | None = None,
+    ):
+        super().__init__()
+        check_not_negative(prnu, name="prnu", unit="(relative gain)")
+        check_not_negative(dsnu, name="dsnu", unit="electrons")
+        if isinstance(seed, bool) or not isinstance(seed, int):
+            raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
+        if full_well is not None:
+            check_positive(full_well, name="full_well", unit="electrons")
+        hold(self, prnu=prnu, dsnu=dsnu, seed=seed, full_well=full_well)
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,C,H,W) to the same shape: see `fixed_pattern`. It draws nothing, so it takes no generator."""
+        full_well, _ = self._resolve(context, None)
+        return fixed_pattern(signal, prnu=self.prnu, dsnu=self.dsnu, full_well=full_well, seed=self.seed)

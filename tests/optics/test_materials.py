@@ -1,0 +1,65 @@
+"""Refractive indices against what the makers and the papers published, not against the formulas they were fitted by."""
+
+from __future__ import annotations
+
+import oracles
+import pytest
+import torch
+
+from kcam.optics import GLASSES, refractive_index
+from kcam.units import nm
+
+PUBLISHED = oracles.sellmeier_published()
+
+
+def index(glass: str | float, *wavelengths: float) -> list[float]:
+    return refractive_index(glass, wavelengths=torch.tensor(wavelengths, dtype=torch.float64)).tolist()
+
+
+@pytest.mark.parametrize("glass", sorted(PUBLISHED))
+def test_dispersion_as_published(glass: str) -> None:
+    lines, precision = PUBLISHED[glass]
+    got = index(glass, *lines)
+    # one unit of the table's last digit: half for its rounding, half for the scatter of the fit about the measurement
+    for wavelength, n, expected in zip(lines, got, lines.values(), strict=True):
+        assert abs(n - expected) <= 1.01 * precision, f"{glass} at {wavelength / nm:.1f} nm: {n:.6f}, not {expected}"
+
+
+@pytest.mark.parametrize("glass", sorted(oracles.ABBE_NUMBERS))
+def test_abbe_number_as_published(glass: str) -> None:
+    n_d, n_f, n_c = index(glass, *(oracles.LINES[line] for line in "dFC"))
+    assert (n_d - 1) / (n_f - n_c) == pytest.approx(oracles.ABBE_NUMBERS[glass], abs=0.005)  # V_d has two decimals
+
+
+def test_every_glass_is_cited_and_has_an_independent_table() -> None:
+    assert len(GLASSES) >= 10
+    assert all(glass.source for glass in GLASSES.values())
+    assert set(GLASSES) == set(PUBLISHED)
+
+
+@pytest.mark.parametrize("glass", sorted(GLASSES))
+def test_normal_dispersion_over_the_visible(glass: str) -> None:
+    low = max(400.0, GLASSES[glass].valid[0] * 1e3)
+    n = refractive_index(glass, wavelengths=torch.linspace(low, 750, 50, dtype=torch.float64) * nm)
+    assert (n.diff() < 0).all(), "every one of these materials bends blue more than red"
+    assert n.dtype == torch.float64
+
+
+def test_a_number_is_an_index_without_dispersion() -> None:
+    assert index(1.5, 400 * nm, 700 * nm) == [1.5, 1.5]
+
+
+@pytest.mark.parametrize("glass", [1.0, 0.9, 1, float("nan")])
+def test_an_index_that_does_not_refract_is_an_error(glass: float) -> None:
+    with pytest.raises(ValueError, match="refractive index .* must be > 1, or the name of a glass"):
+        index(glass, 550 * nm)
+
+
+def test_unknown_glass_lists_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"unknown glass 'BK7'; known: .*N-BK7.*; or give a refractive index"):
+        index("BK7", 550 * nm)
+
+
+def test_wavelength_beyond_the_fit_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"wavelength 2600 nm is outside the Sellmeier range of N-BK7, 300\.\.2500 nm"):
+        index("N-BK7", 550 * nm, 2600 * nm)

@@ -1,0 +1,104 @@
+"""What holds for every file of the library, read from its source."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "kcam"
+FILES = sorted(PACKAGE.rglob("*.py"))
+IDS = [str(path.relative_to(PACKAGE)) for path in FILES]
+
+# Data flows down this list, and imports point up: a module imports only from rows above its own, or from its own
+# package. What stands in one row does not know of its neighbours.
+LAYERS = [
+    {"kcam.units", "kcam.ste", "kcam.cache"},
+    {"kcam.context"},
+    {"kcam.spectral", "kcam.files", "kcam.effects"},
+    {"kcam.scene"},
+    {"kcam.optics"},
+    {"kcam.sensor"},
+    {"kcam.isp"},
+    {"kcam.camera"},
+    {"kcam.planner"},
+    {"kcam.augmentation", "kcam.data", "kcam.style"},
+    {"kcam.tradeoff"},
+    {"kcam.plots"},
+    {"kcam.demo"},
+    {"kcam.cli"},
+    {"kcam.__main__"},
+]
+LAYER = {module: index for index, row in enumerate(LAYERS) for module in row}
+FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath"}
+"""Not among the core dependencies: the library needs none of them at import, nor at run time."""
+LAZY = {"kcam.data": {"h5py", "cv2"}}
+
+
+def part(path: Path) -> str:
+    """kcam/optics/psf.py -> kcam.optics; kcam/camera.py -> kcam.camera."""
+    return f"kcam.{path.relative_to(PACKAGE).parts[0].removesuffix('.py')}"
+
+
+def imports(path: Path) -> list[tuple[str, bool]]:
+    """(module, whether only for the type checker) for each import in a file, `from kcam import x` as kcam.x."""
+    tree = ast.parse(path.read_text())
+    typing_only = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in ast.walk(block)
+    }
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, id(node) in typing_only) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: write imports in full, from kcam.x import y"
+            names = [f"kcam.{alias.name}" for alias in node.names] if node.module == "kcam" else [node.module]
+            found += [(name, id(node) in typing_only) for name in names if name]
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=IDS)
+def test_imports_point_upstream(path: Path) -> None:
+    here = part(path)
+    if here == "kcam.__init__":
+        return
+    assert here in LAYER, f"{path.name} is new: give it a row in LAYERS"
+    for module, typing_only in imports(path):
+        parts = module.split(".")
+        if parts[0] != "kcam" or module == "kcam.__version__" or typing_only:
+            continue
+        there = ".".join(parts[:2])
+        assert there == here or LAYER[there] < LAYER[here], f"{here} imports {there}, which is downstream of it"
+
+
+@pytest.mark.parametrize("path", FILES, ids=IDS)
+def test_only_core_dependencies(path: Path) -> None:
+    packages = {module.split(".")[0] for module, _ in imports(path)}
+    assert not packages & (FORBIDDEN - LAZY.get(part(path), set()))
+
+
+@pytest.mark.parametrize("path", FILES, ids=IDS)
+def test_no_print_no_assert_no_bare_raise(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text())):
+        where = f"{path.name}:{getattr(node, 'lineno', 0)}"
+        assert not isinstance(node, ast.Assert), f"{where}: raise an error that says what was expected"
+        if isinstance(node, ast.Call):
+            assert ast.unparse(node.func) != "print", f"{where}: the library does not print"
+        if isinstance(node, ast.Raise) and node.exc is not None:
+            name = ast.unparse(node.exc.func) if isinstance(node.exc, ast.Call) else ast.unparse(node.exc)
+            bare = not isinstance(node.exc, ast.Call) or not (node.exc.args or node.exc.keywords)
+            abstract = name == "NotImplementedError"  # a method that a subclass must write
+            assert abstract or not (bare and name[:1].isupper()), f"{where}: {name} without a message"
+
+
+def test_typed_package_has_one_version() -> None:
+    import kcam
+
+    assert (PACKAGE / "py.typed").exists()
+    found = [path.name for path in FILES if "__version__ =" in path.read_text()]
+    assert found == ["__init__.py"]
+    assert kcam.__version__.count(".") == 2
