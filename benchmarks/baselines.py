@@ -144,21 +144,35 @@ def angular_spectrum_psf(
     return (window.real**2 + window.imag**2) * grid_pitch**2 / area
 
 
-def per_band_render(bands: Tensor, psfs: Tensor, weights: Tensor, *, border: str = "reflect") -> Tensor:
+def per_band_render(
+    bands: Tensor, psfs: Tensor, weights: Tensor, *, border: str = "reflect", transfers: Tensor | None = None
+) -> Tensor:
     """Convolve every band with its PSF, then sum the bands with the filter's weights: one FFT triple per band.
 
     Args:      bands: (B, L, H, W). psfs: (L, h, w), index n // 2 the origin, applied as a true convolution: kcam's
                upright picture takes them turned by 180 degrees. weights: (C, L). border: a mode of torch's pad.
+               transfers: `transfer_functions` of the PSFs where these have not changed; None computes them here.
     Returns:   (B, C, H, W), in the bands' dtype; the PSF's linear convolution with the padded picture.
     """
     height, width = bands.shape[-2:]
     h, w = psfs.shape[-2:]
-    size = [next_fast_len(n + m - 1, real=True) for n, m in ((height, h), (width, w))]
+    size = transform_size((height, width), (h, w))
     padding = (w - 1 - w // 2, w // 2, h - 1 - h // 2, h // 2)
     out = bands.new_zeros(bands.shape[0], weights.shape[0], height, width)
     for band in range(bands.shape[1]):
         picture = functional.pad(bands[:, band : band + 1], padding, mode=border)
-        spectrum = torch.fft.rfft2(picture, s=size) * torch.fft.rfft2(psfs[band], s=size)
+        transfer = torch.fft.rfft2(psfs[band], s=size) if transfers is None else transfers[band]
+        spectrum = torch.fft.rfft2(picture, s=size) * transfer
         blurred = torch.fft.irfft2(spectrum, s=size)[..., h - 1 : h - 1 + height, w - 1 : w - 1 + width]
         out = out + weights[:, band, None, None] * blurred
     return out
+
+
+def transform_size(picture: tuple[int, int], window: tuple[int, int]) -> list[int]:
+    """Fast FFT lengths for a picture with the border that the window reaches."""
+    return [next_fast_len(n + m - 1, real=True) for n, m in zip(picture, window, strict=True)]
+
+
+def transfer_functions(psfs: Tensor, *, picture: tuple[int, int]) -> Tensor:
+    """rfft2 of PSFs (L, h, w) at the length that `per_band_render` uses, to be kept between pictures."""
+    return torch.fft.rfft2(psfs, s=transform_size(picture, tuple(psfs.shape[-2:])))

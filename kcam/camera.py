@@ -173,7 +173,7 @@ class Camera(nn.Module):
             sensor.Exposure(),
             isp.Clip(),
             isp.LearnedDemosaic(),
-            isp.Clip(),
+            isp.ToneCurve(),
         )
 
     @staticmethod

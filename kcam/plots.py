@@ -293,22 +293,10 @@ def psf_figure(
 
 
 def _mtf(imaging: optics.Imaging, arguments: dict[str, Any], *, wavelength: float) -> tuple[Tensor, Tensor]:
-    """Frequencies [1/m] up to the pixels' limit, and at each distance the contrast of optics and pixel, not aliased.
-
-    Sampled finely enough that the lens passes nothing beyond the folded range; then the fine pixel's sinc is exchanged
-    for the pixel's own.
-    """
-    lens, pitch = imaging.lens, float(imaging.pixel_pitch)
-    cutoff = 1 / (wavelength * lens.f_number)
-    fine = max(1, math.ceil(cutoff * pitch + 0.5))
-    side = min(max(arguments["shape"]) * fine, 511)
-    finer = arguments | {"pixel_pitch": pitch / fine, "shape": (side, side)}
-    mtf = lens.mtf([wavelength], **finer)[:, 0, side // 2, side // 2 :].detach().double().cpu()
-    frequencies = torch.arange(mtf.shape[-1], dtype=torch.float64) * fine / (side * pitch)
-    width = pitch * math.sqrt(imaging.fill_factor)
-    mtf = mtf * torch.sinc(frequencies * width).abs() / torch.sinc(frequencies * pitch / fine)
-    shown = frequencies <= 0.5 / pitch + frequencies[1]
-    return frequencies[shown], mtf[:, shown]
+    """Frequencies [1/m] up to the pixels' limit, and at each distance the contrast of optics and pixel."""
+    height, width = arguments["shape"]
+    mtf = imaging.lens.mtf([wavelength], **arguments)[:, 0, height // 2, width // 2 :].detach().double().cpu()
+    return torch.arange(mtf.shape[-1], dtype=torch.float64) / (width * float(imaging.pixel_pitch)), mtf
 
 
 def _finish(axes: Any, *, title: str, label: str, end: float) -> None:

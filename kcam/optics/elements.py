@@ -1,7 +1,8 @@
 """Thin elements of a lens. Each says what optical path it adds and what it transmits, in one common pupil plane.
 
-An element's OPD is a vergence times r^2 / 2 plus `terms`, a list of (coefficient of each wavelength, map over the pupil):
-vergences are summed as float64 scalars, because in focus they cancel to nothing while each alone is thousands of radians.
+An element's OPD is a vergence times r^2 / 2 plus `terms`, a list of (coefficient of each wavelength, map over the
+pupil): vergences are summed as float64 scalars, because in focus they cancel to nothing while each alone is thousands
+of radians.
 Pixel maps cannot be sampled like smooth paths; they come as `PixelMap` and pass a low-pass of their own.
 """
 
@@ -53,6 +54,7 @@ class Element(nn.Module):
     """A thin element of a lens. Subclasses override what they do; by default an element does nothing."""
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric
+    focuses = True  # whether its vergence counts when the sensor is put in focus; a deliberate defocus must not
 
     def vergence(self, wavelengths: Tensor) -> Tensor:
         """Coefficient of r^2 / 2 in the OPD, (L,) float64 [1/m]; a converging lens has -1 / f."""
@@ -75,7 +77,9 @@ class Aperture(Element):
         raise NotImplementedError
 
     def discs(self) -> tuple[tuple[float, float], ...]:
-        """The transmission as (radius relative to the semi-aperture, weight) of discs; empty where it is a pixel map."""
+        """The transmission as (radius relative to the semi-aperture, weight) of discs; empty where it is a pixel
+        map.
+        """
         return ()
 
     def open_share(self) -> float | Tensor:
@@ -210,7 +214,8 @@ class ThinLens(Element):
     """An ideal thin lens: achromatic, and free of aberration at the distance that it is focused on.
 
     OPD = -r^2 / 2f, and beyond the paraxial range minus what the two spherical waves of the focused pair of points have
-    beyond their parabolas. At other distances the non-paraxial terms leave the aberration that a real lens cannot avoid.
+    beyond their parabolas. At other distances the non-paraxial terms leave the aberration that a real lens cannot
+    avoid.
 
     Args:    focal_length: [m], not 0; negative for a diverging lens; may be a Parameter.
     Raises:  ValueError for 0, NaN or inf.
@@ -237,8 +242,8 @@ class ThinLens(Element):
 class PlanoConvexLens(Element):
     """A thin plano-convex lens with a spherical surface, equation (3.7): OPD = (n - 1) (sqrt(R^2 - r^2) - R).
 
-    Split into -(n - 1) r^2 / 2R and its spherical aberration -(n - 1) r^4 / (2 R (R + sqrt(R^2 - r^2))^2), which does not
-    cancel.
+    Split into -(n - 1) r^2 / 2R and its spherical aberration -(n - 1) r^4 / (2 R (R + sqrt(R^2 - r^2))^2), which does
+    not cancel.
 
     Args:
         radius_of_curvature: R [m], > 0; may be a Parameter.
@@ -271,12 +276,14 @@ class PlanoConvexLens(Element):
 
 
 class Defocus(Element):
-    """A pure change of focus: OPD = vergence * r^2 / 2, the same at all wavelengths.
+    """A pure change of focus: OPD = vergence * r^2 / 2, the same at all wavelengths; `focus_distance=` does not undo
+    it.
 
     Args: vergence: [1/m], positive as if the object came nearer; may be a Parameter. W20 = vergence * a^2 / 2.
     """
 
     symmetric = True
+    focuses = False
 
     def __init__(self, vergence: Scalar) -> None:
         super().__init__()
@@ -299,10 +306,11 @@ class DOE(Element):
     phi_lambda = lambda0 (n_lambda - 1) / (lambda (n_lambda0 - 1)) phi_lambda0.
 
     Args:
-        phase: (n, n) at the design wavelength [rad], wrapped or not; rows along +y, columns along +x; a Parameter trains.
-        design_wavelength: lambda0 [m]. glass: name or index.
+        phase: (n, n) at the design wavelength [rad], wrapped or not; rows along +y, columns along +x; a Parameter
+        trains. design_wavelength: lambda0 [m]. glass: name or index.
         pitch: of the map's pixels [m]; None: the map spans the aperture's bounding square.
-        levels: heights that a fab can etch in one wave of phase; None: continuous. The gradient passes straight through.
+        levels: heights that a fab can etch in one wave of phase; None: continuous. The gradient passes straight
+            through.
     Raises:  ValueError for a map that is not square or not finite, levels < 2, a wavelength not in metres.
     """
 
@@ -336,8 +344,9 @@ class DOE(Element):
 
     def height_map(self) -> Tensor:
         """Height of the profile [m]: phase * lambda0 / (2 pi (n_lambda0 - 1)), equation (3.6)."""
-        index = refractive_index(self.glass, wavelengths=wavelength_grid([self.design_wavelength]))
-        return self.pixel_map(index).values * (self.design_wavelength / (2 * torch.pi * float(index - 1)))
+        design = wavelength_grid([self.design_wavelength])
+        index = float(refractive_index(self.glass, wavelengths=design))
+        return self.pixel_map(design).values * (self.design_wavelength / (2 * torch.pi * (index - 1)))
 
 
 class ZernikeDOE(Element):
@@ -457,8 +466,8 @@ def noll_indices(j: int) -> tuple[int, int]:
 def zernike_sum(coefficients: Tensor, pupil: Pupil) -> Tensor:
     """sum_j c_j Z_j over the pupil, Noll-normalised (unit variance on the unit circle), float64.
 
-    Z = sqrt(n + 1) [sqrt 2] rho^|m| R'(rho^2) cos or sin(m theta), with rho^|m| exp(i m theta) = (x + iy)^|m|: a polynomial,
-    so value and gradient are finite on the axis.
+    Z = sqrt(n + 1) [sqrt 2] rho^|m| R'(rho^2) cos or sin(m theta), with rho^|m| exp(i m theta) = (x + iy)^|m|: a
+    polynomial, so value and gradient are finite on the axis.
     """
     total = torch.zeros_like(pupil.rho2)
     rho2 = pupil.rho2
@@ -516,8 +525,9 @@ def _check_finite(values: Tensor, *, name: str) -> None:
 
 def _check_aperture(value: Scalar, *, name: str) -> None:
     check_positive(value, name=name)
-    if float(float64(value).detach()) > 1:
-        raise ValueError(f"{name} {float(value):g} m is no aperture. Lengths are in metres; did you mean {value} * mm?")
+    metres = float(float64(value).detach())
+    if metres > 1:
+        raise ValueError(f"{name} {metres:g} m is no aperture. Lengths are in metres; did you mean {metres:g} * mm?")
 
 
 def _describe(value: object) -> str:

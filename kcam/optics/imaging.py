@@ -45,7 +45,8 @@ class Imaging(Stage):
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
         distance: of a plain tensor [m]; None: where the lens is focused.
         max_memory: bytes that the transforms may take; bands are split to stay below, with the same result.
-    Raises: ValueError for an unknown propagator or border, a pitch not in metres, a shape or count that is not positive.
+    Raises: ValueError for an unknown propagator or border, a pitch not in metres, a shape or count that is not
+        positive.
     """
 
     def __init__(
@@ -82,7 +83,9 @@ class Imaging(Stage):
         self.layers, self.border, self.fill_factor = layers, border, fill_factor
         self.distance, self.max_memory = distance, float(max_memory)
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
-        self._query(wavelength_grid([550e-9]), torch.zeros(1), (1, 1), torch.empty(0))  # checks the rest
+        query = self._query(wavelength_grid([550e-9]), torch.zeros(1), self.psf_shape or (1, 1), torch.empty(0))
+        if method is not None:
+            choose(query, propagator=propagator, method=method)  # refuses a method that does not exist
 
     def provides(self) -> dict[str, Any]:
         """The optics, for exposure in physical units."""
@@ -95,7 +98,8 @@ class Imaging(Stage):
 
         Args:
             scene: a `Scene`, or bands (B, L, H, W) of `context`'s wavelengths (28 from 420 to 720 nm unless told).
-            colour_filter: absorbed if given: the result is then the filter's, at the cost of its channels, not its bands.
+            colour_filter: absorbed if given: the result is then the filter's, at the cost of its channels, not its
+                bands.
         Returns:   (B, L, H, W), or what the filter gives; dtype and device of the scene.
         Raises:    ValueError for a tensor of the wrong rank or number of bands.
         """
@@ -111,8 +115,8 @@ class Imaging(Stage):
     def psf_window(self, wavelengths: Tensor, *, vergences: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
         """Window of the PSF in pixels: at most 0.1 % of the light outside, or the window is the picture.
 
-        Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a rim of
-        length P around an area A spreads beyond a radius.
+        Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a
+        rim of length P around an area A spreads beyond a radius.
         """
         if self.psf_shape is not None:
             return self.psf_shape
@@ -147,20 +151,17 @@ class Imaging(Stage):
             raise ValueError(f"Imaging takes a Scene or bands (B, L, H, W), got {got}.")
         if bands.shape[1] != context.wavelengths.numel():
             raise ValueError(
-                f"{bands.shape[1]} bands do not match {context.wavelengths.numel()} wavelengths; give a Scene with its own, "
-                "or as many bands as wavelengths."
+                f"{bands.shape[1]} bands do not match {context.wavelengths.numel()} wavelengths; give a Scene with its "
+                "own, or as many bands as wavelengths."
             )
         distance = self.distance if self.distance is not None else self.lens.focus_distance
         if not distance > 0:
             raise ValueError(
                 f"the lens is focused on {distance:g} m, behind itself; say where the bands are: Imaging(distance=2.0)."
             )
+        light = {} if context.illuminant is None else {"illuminant": context.illuminant}
         return Scene.from_bands(
-            bands,
-            wavelengths=context.wavelengths,
-            depth=distance,
-            illuminant=context.illuminant,
-            luminance=context.luminance,
+            bands, wavelengths=context.wavelengths, depth=distance, luminance=context.luminance, **light
         )
 
     def _query(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Query:
@@ -354,11 +355,12 @@ def _layer_shares(depth: Tensor, vergences: Tensor) -> Tensor:
 class _Layers:
     """Depth layers from far to near: each is blurred with its own coverage and laid over what is behind it.
 
-    E_k = sum over layers up to k of (K * m),  l_k = (h * m_k I) / E_k,  a_k = (K * m_k) / E_k,  out <- l_k + (1 - a_k) out
+    E_k = sum over layers up to k of (K * m),  l_k = (h * m_k I) / E_k,  a_k = (K * m_k) / E_k,  out <- l_k + (1 - a_k)
+    out
 
-    with K the PSFs weighted by the channel's filter, relative to their own sum: coverage per *channel*, so that the sum over
-    wavelengths stays inside the transform. Dividing by E_k extends each layer behind the nearer ones, whose blurred edge
-    would otherwise show black. Where all layers share one PSF this is exactly the plain convolution.
+    with K the PSFs weighted by the channel's filter, relative to their own sum: coverage per *channel*, so that the
+    sum over wavelengths stays inside the transform. Dividing by E_k extends each layer behind the nearer ones, whose
+    blurred edge would otherwise show black. Where all layers share one PSF this is exactly the plain convolution.
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
     """
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
-from kcam.optics import sampling
 from kcam.optics.elements import Aperture, Element, Scalar, float64, set_scalar
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
@@ -20,7 +20,8 @@ class Lens(nn.Module):
 
     Args:
         elements: the parts of the lens; exactly one is an aperture.
-        focus_distance: sets the sensor where the lens focuses an object at this distance [m], inf allowed; paraxially, at
+        focus_distance: sets the sensor where the lens focuses an object at this distance [m], inf allowed; paraxially,
+            at
             `focus_wavelength`, once: training the elements later does not move the sensor.
         sensor_distance: pupil to sensor [m], instead; may be a Parameter.
         focus_wavelength: [m].
@@ -43,8 +44,8 @@ class Lens(nn.Module):
         apertures = [element for element in elements if isinstance(element, Aperture)]
         if len(apertures) != 1:
             raise ValueError(
-                f"a lens has exactly one aperture, got {len(apertures)}; add CircularAperture(diameter=5 * mm) or remove "
-                "all but one."
+                f"a lens has exactly one aperture, got {len(apertures)}; add CircularAperture(diameter=5 * mm) or "
+                "remove all but one."
             )
         if (focus_distance is None) == (sensor_distance is None):
             raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
@@ -88,7 +89,9 @@ class Lens(nn.Module):
         )
 
     def pixel_phase_displacement(self, query: Query) -> float:
-        """How far pixel phase maps send all but a thousandth of their light on the sensor [m], at most their Nyquist angle."""
+        """How far pixel phase maps send all but a thousandth of their light on the sensor [m], at most their Nyquist
+        angle.
+        """
         total = 0.0
         for element in self.elements:
             pixels = element.pixel_map(query.wavelengths)
@@ -99,8 +102,11 @@ class Lens(nn.Module):
             phase = pixels.values.detach().to(torch.float64) * float(pixels.factors.max())
             steps = torch.cat([phase.diff(dim=0).flatten(), phase.diff(dim=1).flatten()])
             wrapped = torch.remainder(steps + torch.pi, 2 * torch.pi) - torch.pi
-            slope = float(wrapped.abs().kthvalue(math.ceil(0.999 * wrapped.numel())).values) / (2 * torch.pi * pitch)
-            total += slope * float(query.wavelengths.max()) * float(query.sensor_distance.detach())
+            slope = float(wrapped.abs().kthvalue(math.ceil(0.999 * wrapped.numel())).values) / (2 * torch.pi)
+            # flat pixels on a slope are a blazed grating: step^2 / 12 of the light leaves for its other orders
+            orders = 1 if float(wrapped.square().mean()) / 12 > 1e-4 else 0
+            cycle = float(query.wavelengths.max()) * float(query.sensor_distance.detach()) / pitch
+            total += (slope + orders) * cycle
         return total
 
     def psf(
@@ -129,8 +135,10 @@ class Lens(nn.Module):
             integrate: over the pixels; False: the irradiance at their centres times the pixel's area.
             dtype: of the result, float32 or float64.
         Returns:   (Z, L, H, W), >= 0 up to the sampling error; sums to the share of light in the window.
-        Raises:    ValueError for lengths that are not in metres, distances <= 0, an unknown propagator or method, a shape
-                   that is not two positive integers, or a pupil too coarse for the window (with the sampling that would do).
+        Raises:    ValueError for lengths that are not in metres, distances <= 0, an unknown propagator or method, a
+            shape
+                   that is not two positive integers, or a pupil too coarse for the window (with the sampling that
+                   would do).
         Valid on the axis, for thin elements and scalar light; the model's own error is `propagation.choose(...).error`.
         """
         query = self.query(
@@ -143,7 +151,7 @@ class Lens(nn.Module):
             integrate=integrate,
             dtype=dtype,
         )
-        return choose(query, propagator=propagator, method=method)(query)
+        return self._answer(query, propagator, method)
 
     def query(
         self,
@@ -197,23 +205,38 @@ class Lens(nn.Module):
         method: str | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:
-        """Modulation transfer function, |OTF| / OTF(0), with the pixel's own sinc in it.
+        """Modulation transfer function, |OTF| / OTF(0) of the light in the window, times the pixel's own sinc.
 
-        Returns: (Z, L, H, W) in [0, 1]; index n // 2 is frequency 0, the step is 1 / (n * pixel_pitch) cycles per metre.
+        Returns: (Z, L, H, W) in [0, 1]; index n // 2 is frequency 0, the step is 1 / (n * pixel_pitch) cycles per
+            metre.
         """
-        psf = self.psf(
-            wavelengths,
-            distances=distances,
-            pixel_pitch=pixel_pitch,
-            shape=shape,
-            propagator=propagator,
-            method=method,
-            dtype=dtype,
-        )
-        otf = torch.fft.fftshift(torch.fft.fft2(psf), dim=(-2, -1))
-        # sqrt(re^2 + im^2) with a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
-        magnitude = torch.sqrt(otf.real.square() + otf.imag.square() + torch.finfo(dtype).tiny)
-        return magnitude / psf.sum((-2, -1), keepdim=True)
+        query = self.query(wavelengths, distances=distances, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
+        curves = []
+        for wavelength in query.wavelengths:
+            # sampled finer than the pixels, and times the pixel's sinc: the pixels' own samples would alias
+            fine = 2 * math.ceil(query.evaluation_grid(float(wavelength))[0]) + 1
+            points = replace(
+                query,
+                wavelengths=wavelength[None],
+                pixel_pitch=query.pixel_pitch / fine,
+                shape=(shape[0] * fine, shape[1] * fine),
+                integrate=False,
+            )
+            otf = torch.fft.fftshift(torch.fft.fft2(self._answer(points, propagator, method)[:, 0]), dim=(-2, -1))
+            magnitude2 = otf.real.square() + otf.imag.square()
+            # a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
+            modulation = torch.sqrt(magnitude2 + torch.finfo(dtype).tiny)
+            total = modulation[..., shape[0] * fine // 2, shape[1] * fine // 2][..., None, None]
+            for dim, n in zip((-2, -1), shape, strict=True):
+                modulation = modulation.narrow(dim, n * fine // 2 - n // 2, n)
+                frequency = (torch.arange(n, device=modulation.device) - n // 2) / n  # cycles per pixel
+                sinc = torch.sinc(frequency * query.active).abs().to(modulation)
+                modulation = modulation * (sinc[:, None] if dim == -2 else sinc)
+            curves.append(modulation / total)
+        return torch.stack(curves, dim=1)
+
+    def _answer(self, query: Query, propagator: str, method: str | None) -> Tensor:
+        return choose(query, propagator=propagator, method=method)(query)
 
     def encircled_energy(
         self,
@@ -228,39 +251,32 @@ class Lens(nn.Module):
     ) -> Tensor:
         """Share of the light through the aperture that falls within a circle around the origin.
 
-        The irradiance is evaluated between the pixels, at a quarter of its Nyquist pitch, and summed with the edge weights
-        of a disc: no pixel counts as a whole.
+        The irradiance is evaluated between the pixels, at a quarter of its Nyquist pitch, and summed with the edge
+        weights of a disc: no pixel counts as a whole.
 
         Returns: (Z, L, K + 1) for radii k * pixel_pitch, k = 0..K = min(H, W) // 2, rising from 0.
         """
         largest = min(shape) // 2
+        query = self.query(wavelengths, distances=distances, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
         curves = []
-        for wavelength in wavelength_grid(wavelengths).tolist():
-            fine = 3 * math.ceil(
-                sampling.points_per_pixel(
-                    pixel_pitch=pixel_pitch,
-                    semi_aperture=float(self.aperture.semi_aperture().detach()),
-                    sensor_distance=float(float64(self.sensor_distance).detach()),
-                    wavelength=wavelength,
-                )
-            )
-            side = 2 * (largest * fine + 8) + 2  # even: the disc's weights sit between the points of an even grid
-            points = self.psf(
-                [wavelength],
-                distances=distances,
-                pixel_pitch=check_pixel_pitch(pixel_pitch) / fine,
-                shape=(side + 1, side + 1),
-                propagator=propagator,
-                method=method,
+        for wavelength in query.wavelengths:
+            fine = 3 * math.ceil(query.evaluation_grid(float(wavelength))[0])
+            side = 2 * (largest * fine + 8) + 3
+            points = replace(
+                query,
+                wavelengths=wavelength[None],
+                pixel_pitch=query.pixel_pitch / fine,
+                shape=(side, side),
                 integrate=False,
-                dtype=dtype,
-            )[:, 0]
-            curves.append(torch.stack([_disc_sum(points, k * fine) for k in range(largest + 1)], dim=-1))
+            )
+            image = self._answer(points, propagator, method)[:, 0]
+            curves.append(torch.stack([_disc_sum(image, k * fine) for k in range(largest + 1)], dim=-1))
         return torch.stack(curves, dim=1)
 
     def power(self, wavelengths: Tensor) -> Tensor:
-        """Paraxial power at each wavelength, (L,) float64 [1/m]."""
-        return -sum(element.vergence(wavelengths) for element in self.elements)
+        """Paraxial power at each wavelength, (L,) float64 [1/m], without any `Defocus`."""
+        vergences = (element.vergence(wavelengths) for element in self.elements if element.focuses)
+        return -sum(vergences, torch.zeros_like(wavelengths))
 
     def focal_length(self, wavelength: float | Tensor = 550e-9) -> float | Tensor:
         """Paraxial focal length [m]: a float for a float, (L,) float64 for wavelengths (L,); inf without power."""
@@ -270,7 +286,9 @@ class Lens(nn.Module):
 
     @property
     def focus_distance(self) -> float:
-        """Object distance that is imaged onto the sensor paraxially at `focus_wavelength` [m]; inf, or < 0 if virtual."""
+        """Object distance that is imaged onto the sensor paraxially at `focus_wavelength` [m]; inf, or < 0 if
+        virtual.
+        """
         vergence = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0]) - 1 / float(
             float64(self.sensor_distance).detach()
         )
@@ -291,8 +309,8 @@ class Lens(nn.Module):
         power = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0])
         if power <= 0:
             raise ValueError(
-                f"this lens has a power of {power:g} 1/m at {self.focus_wavelength * 1e9:.4g} nm and cannot focus: add a "
-                "ThinLens or a PlanoConvexLens, or give sensor_distance=."
+                f"this lens has a power of {power:g} 1/m at {self.focus_wavelength * 1e9:.4g} nm and cannot focus: add "
+                "a ThinLens or a PlanoConvexLens, or give sensor_distance=."
             )
         image_vergence = power - 1 / focus_distance
         if image_vergence <= 0:
@@ -303,13 +321,15 @@ class Lens(nn.Module):
         return 1 / image_vergence
 
     def _check_curvature(self) -> None:
-        semi = float(self.aperture.semi_aperture().detach())
+        reach = float(self.aperture.semi_aperture().detach()) * (1 if self.round else math.sqrt(2))
         for element in self.elements:
-            radius = getattr(element, "radius_of_curvature", None)
-            if radius is not None and semi >= float(float64(radius).detach()):
+            if not hasattr(element, "radius_of_curvature"):
+                continue
+            radius = float(float64(element.radius_of_curvature).detach())
+            if reach >= radius:
                 raise ValueError(
-                    f"the aperture reaches r = {semi:g} m, but the surface ends at its radius of curvature "
-                    f"R = {float(radius):g} m (r >= R). Use a diameter below {2 * float(radius):g} m or a larger R."
+                    f"the aperture reaches r = {reach:g} m, but the surface ends at its radius of curvature "
+                    f"R = {radius:g} m (r >= R). Use an aperture below {2 * radius:g} m across or a larger R."
                 )
 
 

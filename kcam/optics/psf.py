@@ -3,8 +3,8 @@
     h(x, y) = |U|^2,  U(x) = 1 / (lambda d sqrt(E)) INT A exp(i k W) exp(-i k x.u' / d) d^2 u'
 
 W is the *residual* optical path: source, lens and propagation are each thousands of radians and cancel in focus, so
-their vergences are summed as float64 scalars first. E is the energy that passes the aperture: a PSF sums to the share of
-that light which falls into its window, and is not normalised to 1.
+their vergences are summed as float64 scalars first. E is the energy that passes the aperture: a PSF sums to the share
+of that light which falls into its window, and is not normalised to 1.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ from kcam.optics.pupil import (
     disc_coverage,
     disc_weights,
     from_image_side,
-    grid_nodes,
     grid_spacing,
     map_weights,
     pupil_tau,
+    square_coverage,
     unfold_quadrant,
 )
-from kcam.optics.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Pair, fast_length, pupil_intensity
+from kcam.optics.transforms import ChirpZTransform, FFTTransform, MatrixTransform, fast_length, pupil_intensity
 
 if TYPE_CHECKING:
     from kcam.optics.lens import Lens
 
 _BLOCK_PHASE = 0.03  # radians; 0.1 costs 2e-3 of the PSF, 0.02 1e-4
 _MAX_BLOCKS = 128
-_CELLS_PER_SAMPLE = 1.7  # of a pixel map for each pupil sample, so that the area of a cut cell is area enough
+_CELLS_PER_SAMPLE = 2.0  # at least, for each pupil sample: the rim cuts cells by their area
+_MOST_CELLS = 2048  # on which several maps are brought together exactly; beyond, by the nearest pixel
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,9 @@ class Query:
         return max(self.shape) // 2 + (sampling.WINDOW_MARGIN if self.integrate else 0)
 
     def evaluation_grid(self, wavelength: float) -> tuple[float, int]:
-        """(points per pixel, points from the origin to the edge) at which the intensity of a wavelength is evaluated."""
+        """(points per pixel, points from the origin to the edge) at which the intensity of a wavelength is
+        evaluated.
+        """
         per_pixel = 1.0
         if self.integrate:
             per_pixel = sampling.points_per_pixel(
@@ -122,8 +125,8 @@ def residual_vergence(query: Query) -> Tensor:
 def residual_path(query: Query, pupil: Pupil) -> tuple[Tensor, Tensor]:
     """The residual OPD as (coefficients (L, Z, T), maps (T, ...)), W = coefficients . maps, both float64.
 
-    The first map is rho^2 with V a^2 / 2; then what the image-side and the object-side sphere have beyond their parabolas,
-    then the elements' own terms. Pixel maps are not part of it.
+    The first map is rho^2 with V a^2 / 2; then what the image-side and the object-side sphere have beyond their
+    parabolas, then the elements' own terms. Pixel maps are not part of it.
     """
     wavelengths = query.wavelengths.to(query.device)
     bands, distances = wavelengths.numel(), query.vergences.numel()
@@ -261,8 +264,9 @@ def _grid_group(
     x, y = from_image_side(nodes[None, :].to(query.device), nodes[:, None].to(query.device), query.tau)
     pupil = query.pupil(x, y)
     coefficients, maps = residual_path(_replace_wavelengths(query, query.wavelengths[members]), pupil)
-    amplitude, energy = _amplitude(query, pupil, count=count, spacing=spacing)
-    field = _pixel_field(query, members, count=count, spacing=spacing)
+    cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
+    amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing)
+    field = None if cells is None else _PixelField.apply(cells.phases, cells.factors, cells.amplitude, cells.weights)
 
     build: dict[str, Callable[[float], object]] = {
         "matrix": lambda s: MatrixTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
@@ -289,23 +293,23 @@ def _replace_wavelengths(query: Query, wavelengths: Tensor) -> Query:
     return replace(query, wavelengths=wavelengths)
 
 
-def _amplitude(query: Query, pupil: Pupil, *, count: int, spacing: float) -> tuple[Tensor, Tensor]:
-    """Quadrature weights times transmission, obliquity and source amplitude, (1 or Z, N, N), and their energy (1 or Z,)."""
-    aperture = query.lens.aperture
-    if aperture.discs():
+def _amplitude(
+    query: Query, pupil: Pupil, cells: _Cells | None, *, count: int, spacing: float
+) -> tuple[Tensor, Tensor]:
+    """Quadrature weights times obliquity and source amplitude, (1 or Z, N, N), and the energy that passes (1 or Z,).
+
+    Without pixel maps the weights hold the aperture; with them `_pixel_field` does, for the rim cuts the maps' pixels.
+    """
+    if cells is None:
         weights = torch.zeros(count // 2, count // 2, dtype=torch.float64)
         tau = float(query.tau.detach())
-        for radius, weight in aperture.discs():
+        for radius, weight in query.lens.aperture.discs():
             image_side = radius * math.sqrt((1 + tau) / (1 + tau * radius**2))
             weights = weights + weight * disc_weights(count, spacing=spacing, radius=image_side)
         transmission = power = unfold_quadrant(weights).to(query.device)
-        if query.lens.has_pixel_phase:
-            transmission = torch.ones_like(power)  # the rim cuts the map's pixels: `_pixel_field` brings both together
     else:
-        mask = aperture.pixel_map(query.wavelengths)
-        lowpass = _map_weights_of(query, mask.values.shape[-1], 1.0, count=count, spacing=spacing, extend=False)
-        values = mask.values.to(query.device, query.dtype)
-        transmission, power = lowpass.forward(torch.stack([values, values**2]))
+        power = cells.weights.forward(cells.power[None])[0].to(torch.float64)
+        transmission = torch.ones_like(power)
     amplitude, energy = transmission[None], power[None]
     if not query.paraxial:
         # a spherical wave's amplitude falls as 1 / R over the pupil: 1 / sqrt(1 + V^2 r^2)
@@ -316,90 +320,115 @@ def _amplitude(query: Query, pupil: Pupil, *, count: int, spacing: float) -> tup
     return amplitude, energy.sum((-2, -1))
 
 
-def _map_weights_of(
-    query: Query, pixels: int, half_width: float, *, count: int, spacing: float, extend: bool
-) -> MapWeights:
+@dataclass(frozen=True)
+class _Cells:
+    """All pixel maps of a lens on one grid of square cells over the pupil, and the way from there to the pupil grid.
+
+    amplitude, power: (C, C) what the aperture transmits, the rim by the exact area of each cell.
+    phases: (E, C, C) of the phase maps [rad], their `factors` (E, L).
+    """
+
+    amplitude: Tensor
+    power: Tensor
+    phases: Tensor
+    factors: Tensor
+    weights: MapWeights
+
+
+def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: float) -> _Cells | None:
+    """The pixel maps of a lens on common cells, or None where it has none."""
+    discs = query.lens.aperture.discs()
+    maps = [pixels for pixels in (e.pixel_map(wavelengths) for e in query.lens.elements) if pixels is not None]
+    if not maps:
+        return None
+    semi = float(query.semi_aperture.detach())
+    if query.semi_aperture.requires_grad and any(pixels.half_width is not None for pixels in maps):
+        raise ValueError(
+            "a DOE with a pitch of its own does not follow a trainable aperture; leave pitch=None, so that the map "
+            "spans the aperture, or give the aperture's size as a number."
+        )
+    widths = [1.0 if pixels.half_width is None else float(pixels.half_width) / semi for pixels in maps]
+    sizes = [pixels.values.shape[-1] for pixels in maps]
+    # cells in which every map's pixels are whole, where there are such: a map that ends inside the aperture continues
+    # with
+    # its outermost pixels, one that reaches beyond it is cut off by the aperture
+    finest = max(range(len(maps)), key=lambda i: sizes[i] / widths[i])
+    base, half_width = sizes[finest], widths[finest]
+    common = math.lcm(*(size for size, width in zip(sizes, widths, strict=True) if width == half_width))
+    base = common if common <= _MOST_CELLS else base
+    refine = math.ceil(_CELLS_PER_SAMPLE * count * half_width / base) if discs or len(maps) > 1 else 1
+    missing = max(0, math.ceil((1 - half_width) * base / (2 * half_width) - 1e-9))
+    cells = (base + 2 * missing) * refine
+    half_width *= (base + 2 * missing) / base
+
+    def look_up(values: Tensor, width: float) -> Tensor:
+        centres = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells * 2 - 1
+        index = ((centres * half_width / width + 1) / 2 * values.shape[-1]).floor().long()
+        index = index.clamp(0, values.shape[-1] - 1).to(query.device)
+        return values.to(query.device, query.dtype).index_select(0, index).index_select(1, index)
+
+    amplitude = torch.ones(cells, cells, dtype=query.dtype, device=query.device)
+    power = amplitude
+    if discs:
+        coverage = sum(w * disc_coverage(cells, half_width=half_width, radius=r) for r, w in discs)
+        amplitude = power = coverage.to(amplitude)
+    phases, factors = [], []
+    for pixels, width in zip(maps, widths, strict=True):
+        values = look_up(pixels.values, width)
+        if pixels.factors is None:
+            amplitude, power = amplitude * values, power * values**2
+        else:
+            phases.append(values)
+            factors.append(pixels.factors)
+    if not phases:
+        phases, factors = [torch.zeros_like(amplitude)], [torch.ones_like(wavelengths)]
+    if not discs and half_width > 1:
+        inside = square_coverage(cells, half_width=half_width).to(amplitude)
+        amplitude, power = amplitude * inside, power * inside
+    weights = _map_weights_of(query, cells, half_width, count=count, spacing=spacing)
+    return _Cells(amplitude, power, torch.stack(phases), torch.stack(factors).to(query.dtype), weights)
+
+
+def _map_weights_of(query: Query, cells: int, half_width: float, *, count: int, spacing: float) -> MapWeights:
     tau = float(query.tau.detach())
     # inside a block a pixel's edge moves by up to k w a tau / 2d / blocks of phase at the corner of pupil and window
     wavenumber = 2 * math.pi / float(query.wavelengths.min())
     a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
     blocks = math.ceil(wavenumber * query.half_window * a * tau / (2 * d) / _BLOCK_PHASE) if tau else 1
     return map_weights(
-        pixels,
+        cells,
         half_width=half_width,
         count=count,
         tau=tau,
         blocks=max(1, min(_MAX_BLOCKS, blocks)),
         spacing=spacing,
-        extend=extend,
         dtype=query.dtype,
     ).to(query.device)
 
 
-def _pixel_field(query: Query, members: list[int], *, count: int, spacing: float) -> Pair | None:
-    """exp(i phi) of all phase maps on flat pixels, low-passed onto the pupil grid: real and imaginary part (G, N, N).
-
-    Where the aperture is round, its rim is cut out of the pixels before the low-pass, by the exact area of each cell.
-    """
-    field: Pair | None = None
-    wavelengths = query.wavelengths[members].to(query.device)
-    discs = query.lens.aperture.discs()
-    for element in query.lens.elements:
-        pixels = element.pixel_map(wavelengths)
-        if pixels is None or pixels.factors is None:
-            continue
-        semi = float(query.semi_aperture.detach())
-        half_width = 1.0 if pixels.half_width is None else float(pixels.half_width) / semi
-        phase = pixels.values.to(query.device, query.dtype)
-        coverage = None
-        if discs:
-            # a map that ends inside the aperture continues with its outermost pixels
-            n = phase.shape[-1]
-            missing = max(0, math.ceil((1 - half_width) * n / (2 * half_width) - 1e-9))
-            if missing:
-                phase = torch.nn.functional.pad(phase[None, None], (missing,) * 4, mode="replicate")[0, 0]
-                half_width *= phase.shape[-1] / n
-            refine = math.ceil(_CELLS_PER_SAMPLE * count / phase.shape[-1] / half_width)
-            phase = phase.repeat_interleave(refine, 0).repeat_interleave(refine, 1)
-            coverage = sum(w * disc_coverage(phase.shape[-1], half_width=half_width, radius=r) for r, w in discs)
-            coverage = coverage.to(phase)
-            discs = ()  # cut once
-        weights = _map_weights_of(
-            query, phase.shape[-1], half_width, count=count, spacing=spacing, extend=coverage is None
-        )
-        own = _PixelField.apply(phase, pixels.factors.to(query.dtype), coverage, weights)
-        field = own if field is None else _complex_product(field, own)
-    return field
-
-
-def _complex_product(a: Pair, b: Pair) -> Pair:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
 class _PixelField(torch.autograd.Function):
-    """Low-passed coverage * exp(i factor * phase) for each factor; only the phase is kept for the backward pass."""
+    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength; no sines are kept for the backward
+    pass.
+    """
 
     @staticmethod
-    def forward(ctx, phase, factors, coverage, weights):
-        ctx.save_for_backward(phase, factors)
-        ctx.coverage, ctx.weights = coverage, weights
-        angle = factors[:, None, None] * phase
-        field = weights.forward(_covered(torch.cat([angle.cos(), angle.sin()]), coverage))
-        field = field.unflatten(0, (2, -1))
+    def forward(ctx, phases, factors, amplitude, weights):
+        ctx.save_for_backward(phases, factors, amplitude)
+        ctx.weights = weights
+        angle = torch.einsum("el,eyx->lyx", factors, phases)
+        field = weights.forward(torch.cat([angle.cos(), angle.sin()]) * amplitude).unflatten(0, (2, -1))
         return field[0], field[1]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_re, grad_im):
-        phase, factors = ctx.saved_tensors
-        onto = _covered(ctx.weights.adjoint(torch.cat([grad_re, grad_im])), ctx.coverage).unflatten(0, (2, -1))
-        angle = factors[:, None, None] * phase
-        total = (factors[:, None, None] * (angle.cos() * onto[1] - angle.sin() * onto[0])).sum(0)
-        return total, None, None, None
-
-
-def _covered(field: Tensor, coverage: Tensor | None) -> Tensor:
-    return field if coverage is None else field * coverage
+        phases, factors, amplitude = ctx.saved_tensors
+        onto = ctx.weights.adjoint(torch.cat([grad_re, grad_im])).unflatten(0, (2, -1))
+        angle = torch.einsum("el,eyx->lyx", factors, phases)
+        cosine, sine = angle.cos(), angle.sin()
+        d_phases = torch.einsum("el,lyx->eyx", factors, (cosine * onto[1] - sine * onto[0]) * amplitude)
+        d_amplitude = (cosine * onto[0] + sine * onto[1]).sum(0) if ctx.needs_input_grad[2] else None
+        return d_phases, None, d_amplitude, None
 
 
 def to_pixels(intensity: Tensor, query: Query, *, per_pixel: float, reach: int) -> Tensor:

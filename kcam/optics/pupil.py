@@ -59,7 +59,8 @@ class Pupil:
     def beyond_paraxial(self, vergence: Tensor) -> Tensor:
         """OPD that a spherical wave of this vergence has beyond its parabola: -V^3 r^4 / (2 (1 + q)^2) [m].
 
-        q = sqrt(1 + V^2 r^2). This is sqrt(z^2 + r^2) - z - r^2 / 2z in a form that neither cancels nor divides by 1/z = 0.
+        q = sqrt(1 + V^2 r^2). This is sqrt(z^2 + r^2) - z - r^2 / 2z in a form that neither cancels nor divides by 1/z
+        = 0.
         """
         if self.paraxial:
             return torch.zeros_like(self.rho2)
@@ -128,12 +129,19 @@ def disc_coverage(cells: int, *, half_width: float, radius: float = 1.0) -> Tens
     return torch.as_tensor(np.diff(np.diff(area, axis=0), axis=1) / (edges[1] - edges[0]) ** 2).clamp_(0, 1)
 
 
+def square_coverage(cells: int, *, half_width: float) -> Tensor:
+    """Share of each cell of a square grid that lies inside the square [-1, 1]^2, (cells, cells) float64, exact."""
+    edges = torch.linspace(-half_width, half_width, cells + 1, dtype=torch.float64).clamp(-1, 1)
+    share = edges.diff() * cells / (2 * half_width)
+    return share[:, None] * share
+
+
 @functools.lru_cache(maxsize=64)
 def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     """Quadrature weights of a disc on one quadrant of a grid: high order, although the rim cuts through cells.
 
-    The disc's exact area in cells of a fifth of the spacing, low-passed by a Kaiser-windowed sinc (half width 6 samples,
-    beta 13.2) at the nodes (j + 1/2) * spacing. They are weights, not a transmission: some are negative.
+    The disc's exact area in cells of a fifth of the spacing, low-passed by a Kaiser-windowed sinc (half width 6
+    samples, beta 13.2) at the nodes (j + 1/2) * spacing. They are weights, not a transmission: some are negative.
 
     Args:      count: samples along the whole axis, even; spacing and radius in the same unit.
     Returns:   (count // 2, count // 2) float64 for x, y > 0, ordered away from the axis; sum * 4 * spacing^2 = area.
@@ -179,8 +187,6 @@ def _low_pass_integral() -> tuple[np.ndarray, np.ndarray]:
 
 def pixel_weights(edges: Tensor, nodes: Tensor, *, spacing: float) -> Tensor:
     """What each flat pixel contributes to each node: the low-passed indicator of [edge_j, edge_j+1] at the nodes.
-
-    The two outermost pixels continue to infinity where `edges` says so (+-inf). Rows sum to 1 when they do.
 
     Args:      edges: (n + 1,) ascending; nodes: (N,), both in units of the semi-aperture; spacing of the nodes.
     Returns:   (N, n) float64.
@@ -251,10 +257,11 @@ class _BandedMatrices:
 
 @dataclass(frozen=True)
 class MapWeights:
-    """Linear map from an n x n pixel map onto an N x N pupil grid: along the rows of the map, then along the grid's columns.
+    """Linear map from an n x n pixel map onto an N x N pupil grid: along the rows of the map, then along the grid's
+    columns.
 
-    In the paraxial plane one matrix each is exact. In the Debye plane the pixels' edges are curved, so the rows are taken in
-    blocks thin enough that a pixel moves by less than a stated phase inside a block.
+    In the paraxial plane one matrix each is exact. In the Debye plane the pixels' edges are curved, so the rows are
+    taken in blocks thin enough that a pixel moves by less than a stated phase inside a block.
     """
 
     along_x: _BandedMatrices
@@ -288,7 +295,6 @@ def map_weights(
     tau: float,
     blocks: int,
     spacing: float,
-    extend: bool,
     dtype: torch.dtype,
 ) -> MapWeights:
     """Weights that bring a map of flat square pixels onto the image-side pupil grid, through a low-pass at its Nyquist.
@@ -299,11 +305,10 @@ def map_weights(
         count, spacing: of the pupil grid.
         tau: (a / d)^2, 0 for the paraxial plane.
         blocks: into how many blocks rows (and columns) are grouped; 1 when tau is 0.
-        extend: continue the outermost pixels to infinity (a phase map), instead of ending there (a transmission).
         dtype: of the weights, which are built in float64.
     Valid when the grid has at least 2.5 samples per cycle of what reaches the window (the default sampling).
     """
-    return _map_weights(pixels, half_width, count, tau, min(blocks, pixels, count), spacing, extend, dtype)
+    return _map_weights(pixels, half_width, count, tau, min(blocks, pixels, count), spacing, dtype)
 
 
 @functools.lru_cache(maxsize=6)
@@ -314,7 +319,6 @@ def _map_weights(
     tau: float,
     blocks: int,
     spacing: float,
-    extend: bool,
     dtype: torch.dtype,
 ) -> MapWeights:
     edges = torch.linspace(-half_width, half_width, pixels + 1, dtype=torch.float64)
@@ -328,12 +332,6 @@ def _map_weights(
     column = _block_centres(nodes, blocks)[:, None] / math.sqrt(1 + tau)
     true_x2 = column**2 * (1 + tau * edges**2) / torch.clamp(1 - tau * column**2, min=1e-3)
     along_y = to_image_side(torch.sqrt(true_x2), edges[None].expand_as(true_x2), tau_)[1]
-    if extend:
-        infinity = torch.tensor([math.inf], dtype=torch.float64)
-        along_x, along_y = (
-            torch.cat([-infinity.expand(len(e), 1), e[:, 1:-1], infinity.expand(len(e), 1)], dim=1)
-            for e in (along_x, along_y)
-        )
     return MapWeights(
         *(
             _BandedMatrices.build([pixel_weights(e, nodes, spacing=spacing).T for e in edges], dtype=dtype)

@@ -15,6 +15,7 @@ from kcam.optics.pupil import EDGE_MARGIN
 KAPPA = 2.7  # pupil samples per cycle of the fastest fringe that reaches the window
 WINDOW_MARGIN = 8  # pixels evaluated beyond the window, so that the pixel's sinc filter finds its light there
 _NYQUIST_SHARE = 0.95  # of the intensity's Nyquist pitch lambda d / 4a that the evaluation grid may use
+_CONTINUED = 64  # points over which the outermost value continues
 MAX_PUPIL_SAMPLES = 16_384
 
 
@@ -35,7 +36,8 @@ def pupil_samples(
         displacement: s_max, how far the smooth part of the pupil sends its rays on the sensor [m].
     Returns:   N >= 64.
     Valid when kappa > 1: below, the transform's replicas enter the window and energy is counted twice.
-    Source:    the project's numerics note, section 5.1: kappa 2.5 gives a median L1 error of 5e-5 and a worst of 1.7e-3.
+    Source:    the project's numerics note, section 5.1: kappa 2.5 gives a median L1 error of 5e-5 and a worst of
+        1.7e-3.
     """
     fringes = 2 * semi_aperture * (half_window + displacement) / (wavelength * sensor_distance)
     return max(64, 32 * math.ceil((kappa * fringes + 2 * EDGE_MARGIN) / 32))
@@ -66,7 +68,8 @@ def points_per_pixel(*, pixel_pitch: float, semi_aperture: float, sensor_distanc
 
 @functools.lru_cache(maxsize=64)
 def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0) -> Tensor:
-    """Integral over each pixel of what is known at a grid of points: row m is the integral of sinc(q x - k) over pixel m.
+    """Integral over each pixel of what is known at a grid of points: row m is the integral of sinc(q x - k) over pixel
+    m.
 
     Exact for an intensity that is band-limited to the grid's Nyquist rate, as |U|^2 is, up to the light beyond `reach`.
 
@@ -77,9 +80,15 @@ def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0)
     Returns: (n, 2 reach + 1) float64; rows sum to 1 up to the truncation.
     """
     centres = np.arange(pixels) - pixels // 2
-    points = np.arange(-reach, reach + 1)
+    beyond = 0 if float(per_pixel).is_integer() else _CONTINUED
+    points = np.arange(-reach - beyond, reach + beyond + 1)
     upper, lower = (sici(np.pi * ((centres[:, None] + side * active / 2) * per_pixel - points))[0] for side in (1, -1))
-    return torch.as_tensor((upper - lower) / (np.pi * per_pixel * active))
+    box = (upper - lower) / (np.pi * per_pixel * active)
+    if beyond:  # the tails of a sinc between the points: the outermost value continues, instead of an edge to darkness
+        box[:, beyond] += box[:, :beyond].sum(1)
+        box[:, -beyond - 1] += box[:, -beyond:].sum(1)
+        box = box[:, beyond:-beyond]
+    return torch.as_tensor(np.ascontiguousarray(box))
 
 
 def point_comb(pixels: int, *, reach: int) -> Tensor:

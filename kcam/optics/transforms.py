@@ -1,7 +1,7 @@
 """From the pupil to the sensor: the Fourier transforms that hit the pixel grid, and their adjoints.
 
-All compute U(x, y) = sum_jk P(xi_j, eta_k) exp(-i s (x xi_j + y eta_k)) for points x = m * step, m = -K..K, and differ in
-cost alone. Each is used through `pupil_intensity`, which forms P from its phase, keeps only U for the backward pass
+All compute U(x, y) = sum_jk P(xi_j, eta_k) exp(-i s (x xi_j + y eta_k)) for points x = m * step, m = -K..K, and differ
+in cost alone. Each is used through `pupil_intensity`, which forms P from its phase, keeps only U for the backward pass
 and computes sines and cosines again there (a bank of PSFs would otherwise hold every pupil in memory).
 """
 
@@ -71,8 +71,8 @@ class Transform(Protocol):
 class MatrixTransform:
     """Split matrix triple product: even and odd parts on both axes, so that real matrices of half the size do.
 
-    2 M N (N + M) real operations; any points that are symmetric about 0. Layout: quadrants ++, +-, -+, -- (sign of y, x),
-    each ordered away from the axis.
+    2 M N (N + M) real operations; any points that are symmetric about 0. Layout: quadrants ++, +-, -+, -- (sign of y,
+    x), each ordered away from the axis.
     Source: Soummer et al., Opt. Express 15, 15935 (2007), for the matrix form; the split is exact algebra.
     """
 

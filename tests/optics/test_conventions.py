@@ -50,7 +50,9 @@ def centroid(psf: torch.Tensor) -> tuple[float, float]:
     return float((psf.sum(1) * rows).sum() / psf.sum()), float((psf.sum(0) * columns).sum() / psf.sum())
 
 
-def image(lens: optics.Lens, shape: tuple[int, int] = (65, 65), distance: float = math.inf, **arguments) -> torch.Tensor:
+def image(
+    lens: optics.Lens, shape: tuple[int, int] = (65, 65), distance: float = math.inf, **arguments
+) -> torch.Tensor:
     return lens.psf([WAVELENGTH], distances=distance, pixel_pitch=PITCH, shape=shape, **arguments)[0, 0].detach()
 
 
@@ -108,7 +110,9 @@ def test_an_aperture_map_has_x_along_columns_and_y_down_rows() -> None:
 
 def test_a_positive_vergence_is_a_nearer_object_and_a_delay_at_the_rim() -> None:
     near = image(lens(), distance=0.8, dtype=torch.float64, propagator="fresnel")
-    assert torch.allclose(image(lens(optics.Defocus(1.25)), dtype=torch.float64, propagator="fresnel"), near, atol=1e-12)
+    assert torch.allclose(
+        image(lens(optics.Defocus(1.25)), dtype=torch.float64, propagator="fresnel"), near, atol=1e-12
+    )
     # Noll's Z4 = sqrt(3) (2 rho^2 - 1): OPD = V r^2 / 2 = V a^2 / 2 rho^2
     coefficients = torch.zeros(4, dtype=torch.float64)
     coefficients[3] = 1.25 * (DIAMETER / 2) ** 2 / (4 * math.sqrt(3))

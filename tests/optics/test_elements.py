@@ -89,7 +89,9 @@ def test_zernike_doe_disperses_by_equation_3_8() -> None:
     at = pupil()
     coefficients = torch.tensor([0, 0, 0, 2.0, -1.0, 0.5], dtype=torch.float64)
     opd = path(optics.ZernikeDOE(coefficients, design_wavelength=500 * nm, glass="N-BK7"), at)
-    n = optics.refractive_index("N-BK7", wavelengths=torch.cat([WAVELENGTHS, torch.tensor([500 * nm], dtype=torch.float64)]))
+    n = optics.refractive_index(
+        "N-BK7", wavelengths=torch.cat([WAVELENGTHS, torch.tensor([500 * nm], dtype=torch.float64)])
+    )
     height = zernike_sum(coefficients, at) * 500 * nm / (2 * math.pi) / (n[3] - 1)  # (3.6) at the design wavelength
     torch.testing.assert_close(opd, (n[:3, None] - 1) * height, rtol=1e-12, atol=0)
 
@@ -224,7 +226,11 @@ BAD = [
     (lambda: optics.ApertureMap(2 * torch.ones(3, 3), width=4 * mm), ValueError, r"in \[0, 1\], got 2\.\.2; divide by"),
     (lambda: optics.ApertureMap(torch.zeros(3, 3), width=4 * mm), ValueError, r"0 everywhere: no light.*Open at least"),
     (lambda: optics.ApertureMap(NAN * torch.ones(3, 3), width=4 * mm), ValueError, r"transmission has 9 values .* NaN"),
-    (lambda: optics.ApertureMap(torch.ones(3, 3).bool(), width=4 * mm), TypeError, r"floating-point .* torch.bool tens"),
+    (
+        lambda: optics.ApertureMap(torch.ones(3, 3).bool(), width=4 * mm),
+        TypeError,
+        r"floating-point .* torch.bool tens",
+    ),
     (lambda: optics.ThinLens(0.0), ValueError, r"focal_length must be finite and not 0 m, got 0"),
     (lambda: optics.ThinLens(math.inf), ValueError, r"focal_length must be finite and not 0 m, got inf"),
     (lambda: optics.PlanoConvexLens(-25 * mm), ValueError, r"radius_of_curvature must be finite and > 0 m, got -0.025"),
@@ -233,7 +239,11 @@ BAD = [
     (lambda: optics.Defocus(NAN), ValueError, r"vergence must be a finite number of 1/m, got nan"),
     (lambda: optics.DOE(torch.zeros(4, 5)), ValueError, r"phase must be square \(n, n\) with n >= 1, got .*\(4, 5\)"),
     (lambda: optics.DOE(torch.zeros(0, 0)), ValueError, r"phase must be square \(n, n\) with n >= 1"),
-    (lambda: optics.DOE(torch.zeros(4, 4, dtype=torch.long)), TypeError, r"phase must be a floating-point .*torch.int64"),
+    (
+        lambda: optics.DOE(torch.zeros(4, 4, dtype=torch.long)),
+        TypeError,
+        r"phase must be a floating-point .*torch.int64",
+    ),
     (lambda: optics.DOE(np.zeros((4, 4))), TypeError, r"phase must be a floating-point tensor .* got ndarray"),
     (lambda: optics.DOE(torch.full((4, 4), NAN)), ValueError, r"phase has 16 values that are NaN or infinite"),
     (lambda: optics.DOE(torch.zeros(4, 4), levels=1), ValueError, r"levels must be an integer >= 2 .* got 1"),
@@ -243,7 +253,11 @@ BAD = [
     (lambda: optics.DOE(torch.zeros(4, 4), design_wavelength=0.55), ValueError, r"did you mean 0.55 \* um"),
     (lambda: optics.DOE(torch.zeros(4, 4), glass="window"), ValueError, r"unknown glass 'window'"),
     (lambda: optics.ZernikeDOE(torch.zeros(2, 3)), ValueError, r"coefficients must be a vector \(K,\) with K >= 1"),
-    (lambda: optics.ZernikeDOE(torch.tensor([1, 2])), TypeError, r"coefficients must be a floating-point .*torch.int64"),
+    (
+        lambda: optics.ZernikeDOE(torch.tensor([1, 2])),
+        TypeError,
+        r"coefficients must be a floating-point .*torch.int64",
+    ),
     (lambda: optics.ZernikeDOE(torch.tensor([NAN, 0])), ValueError, r"coefficients has 1 values that are NaN"),
     (lambda: optics.ZernikeAberration(torch.zeros(0)), ValueError, r"coefficients must be a vector \(K,\) with K >= 1"),
     (lambda: optics.RadialDOE(torch.zeros(3)), ValueError, r"profile needs at least 4 radii .* got 3"),

@@ -135,9 +135,7 @@ def test_scalars(scalar: str, method: str, propagator: str) -> None:
             elements.append(optics.ZernikeDOE(torch.tensor([0, 0.5, 0.2, 0, 0.7], dtype=torch.float64)))
         distance = parts.get("sensor_distance", FOCAL)
         # two distances, one of them infinite: the vergence may be 0
-        return psf(
-            *elements, propagator=propagator, method=method, sensor_distance=distance, distances=(0.9, math.inf)
-        )
+        return psf(*elements, propagator=propagator, method=method, sensor_distance=distance, distances=(0.9, math.inf))
 
     # the fft's grid is stretched with the pupil: differences see its sampling error move, the gradient rightly does not
     moves = method == "fft" and scalar in ("diameter", "sensor_distance")
@@ -194,7 +192,11 @@ def test_point_samples_have_gradients_too() -> None:
 
 
 def test_several_parameters_at_once() -> None:
-    phase, focal, diameter = noise(4, 4), torch.tensor(1.01, dtype=torch.float64), torch.tensor(0.97, dtype=torch.float64)
+    phase, focal, diameter = (
+        noise(4, 4),
+        torch.tensor(1.01, dtype=torch.float64),
+        torch.tensor(0.97, dtype=torch.float64),
+    )
 
     def function(phase: Tensor, focal: Tensor, diameter: Tensor) -> Tensor:
         doe = Given.put(optics.DOE(torch.zeros(4, 4)), phase=phase)
@@ -226,7 +228,12 @@ def test_rays() -> None:
         defocus = Given.put(optics.Defocus(0.0), added_vergence=vergence)
         lens = optics.Lens(optics.CircularAperture(3 * mm), LENS, defocus, sensor_distance=FOCAL)
         image = lens.psf(
-            [550 * nm], distances=math.inf, pixel_pitch=9 * um, shape=(9, 9), propagator="geometric", dtype=torch.float64
+            [550 * nm],
+            distances=math.inf,
+            pixel_pitch=9 * um,
+            shape=(9, 9),
+            propagator="geometric",
+            dtype=torch.float64,
         )
         return (image * weight).sum()
 

@@ -153,7 +153,11 @@ def test_mtf_and_encircled_energy_have_finite_gradients() -> None:
 
 ROUND = optics.CircularAperture(5 * mm)
 LENSES = [
-    (lambda: optics.Lens(optics.ThinLens(0.05), focus_distance=2.0), ValueError, r"exactly one aperture, got 0; add Cir"),
+    (
+        lambda: optics.Lens(optics.ThinLens(0.05), focus_distance=2.0),
+        ValueError,
+        r"exactly one aperture, got 0; add Cir",
+    ),
     (
         lambda: optics.Lens(ROUND, optics.SquareAperture(4 * mm), optics.ThinLens(0.05), focus_distance=2.0),
         ValueError,

@@ -1,0 +1,220 @@
+"""How things are timed and written down: side by side in one process, A B A B, in CPU seconds of one thread.
+
+The machine is shared, so a time alone says little: each round runs the baseline and then every contestant, and the
+ratio is taken within the round. What is published is the median of the rounds' ratios.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import platform
+import re
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+ROOT = Path(__file__).parents[1]
+VERSIONS = ("torch", "numpy", "scipy", "kornia")
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """One way to compute something.
+
+    who: for the table. call: what is timed. check: errors of its result against the float64 reference, by name.
+    dtype: of the result. default: whether it is what kcam does unless told. share: part of the whole work that `call`
+    does (a loop over a fair sample of the wavelengths, say); its time is divided by it.
+    """
+
+    who: str
+    call: Callable[[], Any]
+    check: Callable[[Any], dict[str, float]]
+    dtype: str = "float32"
+    default: bool = False
+    share: float = 1.0
+
+    @property
+    def ours(self) -> bool:
+        """Whether this is kcam."""
+        return self.who.startswith("kcam")
+
+
+def race(
+    op: str, *, size: str, direction: str, contestants: list[Contestant], seconds: float, most_rounds: int = 9
+) -> list[dict[str, Any]]:
+    """Time the contestants side by side; the first is the baseline that all ratios refer to.
+
+    Args:      op, size, direction: for the rows. seconds: roughly how long the rounds may take; at least 3 rounds
+               (1 where seconds is 0), after a warm-up in which memory and errors are measured.
+    Returns:   a row for each contestant: its time, the ratio of times (baseline over it), its errors, and the ratio of
+               errors (the best baseline's over it, the least over the kinds of error that are called l1).
+    """
+    rows, once = [], []
+    for contestant in contestants:
+        result, first_call, memory = _watched(contestant.call)
+        rows.append(
+            {
+                "op": op,
+                "who": contestant.who,
+                "direction": direction,
+                "size": size,
+                "dtype": contestant.dtype,
+                "device": "cpu",
+                "threads": torch.get_num_threads(),
+                "default": contestant.default,
+                "baseline": not contestant.ours,
+                "share_timed": contestant.share,
+                "error": contestant.check(result),
+                "peak_memory": memory,
+                "first_call": first_call / contestant.share,
+            }
+        )
+        del result
+        once.append(_cpu_time(contestant.call) if contestant.ours else first_call)
+    repeats = [
+        1 if not c.ours else max(1, min(5, int(0.25 * once[0] / t))) for c, t in zip(contestants, once, strict=True)
+    ]
+    round_time = sum(t * r for t, r in zip(once, repeats, strict=True))
+    rounds = max(3, min(most_rounds, int(seconds / round_time))) if seconds else 1
+    times: list[list[list[float]]] = [[] for _ in contestants]
+    for _ in range(rounds):
+        for own, contestant, count in zip(times, contestants, repeats, strict=True):
+            own.append([_cpu_time(contestant.call) / contestant.share for _ in range(count)])
+    for row, own in zip(rows, times, strict=True):
+        every = [t for part in own for t in part]
+        ratios = [statistics.median(base) / statistics.median(part) for base, part in zip(times[0], own, strict=True)]
+        row["seconds"] = statistics.median(every)
+        row["seconds_iqr"] = np.percentile(every, [25, 75]).tolist()
+        row["ratio"] = statistics.median(ratios)
+        row["ratio_iqr"] = np.percentile(ratios, [25, 75]).tolist()
+        row["rounds"], row["calls"] = rounds, len(every)
+        row["error_ratio"] = None if row["baseline"] else _error_ratio(row, rows)
+    return rows
+
+
+def _error_ratio(row: dict[str, Any], rows: list[dict[str, Any]]) -> float | None:
+    """How many times lower the error is than the best baseline's: the least over median, max and so on."""
+    kinds = [kind for kind in row["error"] if kind.startswith("l1")]
+    best = {kind: min(other["error"][kind] for other in rows if other["baseline"]) for kind in kinds}
+    return min((best[kind] / row["error"][kind] for kind in kinds), default=None)
+
+
+def _cpu_time(call: Callable[[], Any]) -> float:
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+def _watched(call: Callable[[], Any]) -> tuple[Any, float, int | None]:
+    """(result, CPU seconds, bytes of memory at the peak beyond those at the start; None where Linux does not say)."""
+    before = _resident(reset=True)
+    start = time.process_time()
+    result = call()
+    seconds = time.process_time() - start
+    peak = _resident()
+    return result, seconds, None if before is None or peak is None else max(0, peak - before)
+
+
+def _resident(*, reset: bool = False) -> int | None:
+    """Peak resident memory of this process since the last reset [bytes]."""
+    try:
+        if reset:
+            ctypes.CDLL(None).malloc_trim(0)  # what the allocator keeps would hide what the call needs
+            Path("/proc/self/clear_refs").write_text("5")
+        return int(re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())[1]) * 1024
+    except (OSError, AttributeError, TypeError):
+        return None
+
+
+# ---- what is written ---------------------------------------------------------------------------------------------
+
+
+def environment() -> dict[str, Any]:
+    """Where and when: commit, versions, machine, date."""
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": _commit(),
+        "versions": {"python": platform.python_version(), **{name: metadata.version(name) for name in VERSIONS}},
+        "machine": f"{platform.system()} {platform.machine()}, {_processor()}",
+        "threads": torch.get_num_threads(),
+        "clock": "CPU seconds of the process; ratios are taken within a round, and their median is given",
+    }
+
+
+def _commit() -> str:
+    """Hash of HEAD, marked where the working tree differs from it."""
+    try:
+        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
+        changed = subprocess.run(
+            ["git", "status", "--porcelain", "--", "kcam", "benchmarks/*.py"],
+            cwd=ROOT, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head.stdout.strip() + (" with changes" if changed.stdout.strip() else "")
+
+
+def _processor() -> str:
+    try:
+        found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        found = None
+    return found[1] if found else platform.processor() or "unknown processor"
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Numbers with four digits: more would only make diffs."""
+
+    def rounded(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.4g}")
+        if isinstance(value, dict):
+            return {key: rounded(item) for key, item in value.items()}
+        return [rounded(item) for item in value] if isinstance(value, list) else value
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(rounded(content), indent=1) + "\n")
+
+
+def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
+    """The rows, one small table for each race, in the same columns."""
+    for op, direction in dict.fromkeys((row["op"], row["direction"]) for row in rows):
+        race_rows = [row for row in rows if (row["op"], row["direction"]) == (op, direction)]
+        table = Table(
+            title=f"[bold]{op}[/], {direction}  [dim]{race_rows[0]['size']}[/]", box=None, title_justify="left"
+        )
+        table.add_column("", min_width=33)
+        for name, width in (("error: median/max", 17), ("gradient: L2/1-cos", 17)):
+            table.add_column(name, min_width=width, no_wrap=True)
+        for name, width in (("CPU ms", 6), ("IQR", 11), ("MB", 5), ("first", 6), ("faster", 6), ("lower error", 6)):
+            table.add_column(name, justify="right", min_width=width, no_wrap=True)
+        for row in race_rows:
+            low, high = row["seconds_iqr"]
+            table.add_row(
+                row["who"] + (" [dim](default)[/]" if row["default"] else ""),
+                _errors(row["error"], "l1_median", "l1_max", "relative_max"),
+                _errors(row["error"], "gradient", "1 - cosine"),
+                f"{row['seconds'] * 1e3:.0f}",
+                f"{low * 1e3:.0f}-{high * 1e3:.0f}",
+                "-" if row["peak_memory"] is None else f"{row['peak_memory'] / 1e6:.0f}",
+                f"{row['first_call'] * 1e3:.0f}",
+                "-" if row is race_rows[0] else f"{row['ratio']:.3g}",
+                "-" if row["error_ratio"] is None else f"{row['error_ratio']:.3g}",
+            )
+        console.print(table, "")
+
+
+def _errors(error: dict[str, float], *kinds: str) -> str:
+    return " / ".join(f"{error[kind]:.1e}" for kind in kinds if kind in error)
