@@ -14,6 +14,8 @@ from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
+_ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
+
 
 class Lens(nn.Module):
     """Thin elements whose optical paths add in one pupil plane, in front of a sensor.
@@ -89,8 +91,11 @@ class Lens(nn.Module):
         )
 
     def pixel_phase_displacement(self, query: Query) -> float:
-        """How far pixel phase maps send all but a thousandth of their light on the sensor [m], at most their Nyquist
-        angle.
+        """How far flat pixels send all but a few 1e-4 of their light on the sensor [m].
+
+        A step of delta radians between neighbours turns light by delta lambda d / 2 pi p, at most to the pixels'
+        Nyquist angle; and flat pixels on a slope are a blazed grating, of whose light delta^2 / 2 pi^2 M lies beyond
+        order M.
         """
         total = 0.0
         for element in self.elements:
@@ -100,11 +105,11 @@ class Lens(nn.Module):
             half_width = query.semi_aperture.detach() if pixels.half_width is None else pixels.half_width
             pitch = 2 * float(half_width) / pixels.values.shape[-1]
             phase = pixels.values.detach().to(torch.float64) * float(pixels.factors.max())
-            steps = torch.cat([phase.diff(dim=0).flatten(), phase.diff(dim=1).flatten()])
-            wrapped = torch.remainder(steps + torch.pi, 2 * torch.pi) - torch.pi
-            slope = float(wrapped.abs().kthvalue(math.ceil(0.999 * wrapped.numel())).values) / (2 * torch.pi)
-            # flat pixels on a slope are a blazed grating: step^2 / 12 of the light leaves for its other orders
-            orders = 1 if float(wrapped.square().mean()) / 12 > 1e-4 else 0
+            steps = [torch.remainder(phase.diff(dim=dim) + torch.pi, 2 * torch.pi) - torch.pi for dim in (0, 1)]
+            sizes = torch.cat([step.abs().flatten() for step in steps])
+            slope = float(sizes.kthvalue(math.ceil(0.999 * sizes.numel())).values) / (2 * torch.pi)
+            lost = sum(float(step.square().mean()) for step in steps) / (2 * torch.pi**2)
+            orders = math.ceil(lost / _ORDERS_LEFT_OUT) if lost > _ORDERS_LEFT_OUT else 0
             cycle = float(query.wavelengths.max()) * float(query.sensor_distance.detach()) / pitch
             total += (slope + orders) * cycle
         return total

@@ -51,9 +51,8 @@ def radial_psf(query: Query) -> Tensor:
     amplitude, energy = _ring_amplitude(query, pupil, rho * weights)
     field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
 
-    with torch.no_grad():
-        t = torch.arange(math.ceil(largest * corner / _TABLE_STEP) + 8, dtype=torch.float64, device=query.device)
-        table = torch.special.bessel_j0(t[:, None] * _TABLE_STEP * rho)
+    t = torch.arange(math.ceil(largest * corner / _TABLE_STEP) + 8, dtype=torch.float64, device=query.device)
+    table = _BesselJ0.apply(t[:, None] * _TABLE_STEP * rho)
     transformed = 2 * math.pi * field @ table.T  # (2, L, Z, T)
 
     bands = []
@@ -69,14 +68,27 @@ def radial_psf(query: Query) -> Tensor:
     return torch.stack(bands, dim=1)
 
 
+class _BesselJ0(torch.autograd.Function):
+    """J0 with its derivative -J1, which torch.special leaves out without a word."""
+
+    @staticmethod
+    def forward(ctx, x):
+        ctx.save_for_backward(x)
+        return torch.special.bessel_j0(x)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (x,) = ctx.saved_tensors
+        return -grad * torch.special.bessel_j1(x)
+
+
 def _ring_nodes(query: Query, count: int) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights over the open part of the radius, image-side coordinates."""
     nodes, weights = (torch.as_tensor(v, device=query.device) for v in np.polynomial.legendre.leggauss(count))
     discs = query.lens.aperture.discs()
     inner = discs[1][0] if len(discs) > 1 else 0.0
     if inner:
-        tau = float(query.tau.detach())
-        inner *= math.sqrt((1 + tau) / (1 + tau * inner**2))
+        inner = inner * torch.sqrt((1 + query.tau) / (1 + query.tau * inner**2))
     return inner + (1 - inner) * (nodes + 1) / 2, weights * (1 - inner) / 2
 
 
@@ -142,7 +154,9 @@ def angular_spectrum_psf(query: Query) -> Tensor:
     bands = []
     for index, wavelength in enumerate(query.wavelengths.tolist()):
         spread = float(displacement[index])
-        steepest = (a + spread) / math.hypot(a + spread, d) / wavelength  # cycles per metre behind the rim
+        # from the rim light goes to the far edge of the window, and a little further: its cycles per metre in the grid
+        across = a + max(query.half_window, spread) + 10 * wavelength * d / (2 * a)
+        steepest = across / math.hypot(across, d) / wavelength
         pitch = 1 / (2.2 * steepest)
         # beyond the rays the rim diffracts light into tails, which must not wrap around into the window
         tails = 50 * wavelength * d / (2 * a)
@@ -260,8 +274,10 @@ def geometric_psf(query: Query) -> Tensor:
         row = torch.einsum("zt,tvu->zvu", coefficient, slopes_y) * scale + query.shape[0] // 2
         bands.append(_splat(power, row, column, query.shape))
     images = torch.stack(bands, dim=1).to(query.dtype)
-    trained = query.vergences.requires_grad or any(p.requires_grad for p in query.lens.parameters())
-    return images if trained and torch.is_grad_enabled() else images.detach()
+    # the rays' own coordinates carry a graph; the result does only where something else in the path has a gradient
+    centre = torch.zeros(1, dtype=torch.float64, device=query.device)
+    trained = any(part.requires_grad for part in residual_path(query, query.pupil(centre, centre)))
+    return images if trained else images.detach()
 
 
 def _splat(power: Tensor, row: Tensor, column: Tensor, shape: tuple[int, int]) -> Tensor:

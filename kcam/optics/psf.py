@@ -30,7 +30,14 @@ from kcam.optics.pupil import (
     square_coverage,
     unfold_quadrant,
 )
-from kcam.optics.transforms import ChirpZTransform, FFTTransform, MatrixTransform, fast_length, pupil_intensity
+from kcam.optics.transforms import (
+    ChirpZTransform,
+    FFTTransform,
+    MatrixTransform,
+    Pair,
+    fast_length,
+    pupil_intensity,
+)
 
 if TYPE_CHECKING:
     from kcam.optics.lens import Lens
@@ -266,7 +273,7 @@ def _grid_group(
     coefficients, maps = residual_path(_replace_wavelengths(query, query.wavelengths[members]), pupil)
     cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
     amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing)
-    field = None if cells is None else _PixelField.apply(cells.phases, cells.factors, cells.amplitude, cells.weights)
+    field = None if cells is None else _pixel_field(query, cells, spacing=spacing)
 
     build: dict[str, Callable[[float], object]] = {
         "matrix": lambda s: MatrixTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
@@ -302,13 +309,17 @@ def _amplitude(
     """
     if cells is None:
         weights = torch.zeros(count // 2, count // 2, dtype=torch.float64)
-        tau = float(query.tau.detach())
         for radius, weight in query.lens.aperture.discs():
-            image_side = radius * math.sqrt((1 + tau) / (1 + tau * radius**2))
-            weights = weights + weight * disc_weights(count, spacing=spacing, radius=image_side)
+
+            def rim(tau: float, radius: float = radius) -> Tensor:
+                image_side = radius * math.sqrt((1 + tau) / (1 + tau * radius**2))
+                return disc_weights(count, spacing=spacing, radius=image_side)
+
+            weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
         transmission = power = unfold_quadrant(weights).to(query.device)
     else:
-        power = cells.weights.forward(cells.power[None])[0].to(torch.float64)
+        power = _following(query.tau, lambda tau: cells.weights(tau).forward(cells.power[None])[0], spacing=spacing)
+        power = power.to(torch.float64)
         transmission = torch.ones_like(power)
     amplitude, energy = transmission[None], power[None]
     if not query.paraxial:
@@ -326,13 +337,14 @@ class _Cells:
 
     amplitude, power: (C, C) what the aperture transmits, the rim by the exact area of each cell.
     phases: (E, C, C) of the phase maps [rad], their `factors` (E, L).
+    weights: from the cells to the pupil grid, for a tau = (a / d)^2.
     """
 
     amplitude: Tensor
     power: Tensor
     phases: Tensor
     factors: Tensor
-    weights: MapWeights
+    weights: Callable[[float], MapWeights]
 
 
 def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: float) -> _Cells | None:
@@ -385,25 +397,55 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     if not discs and half_width > 1:
         inside = square_coverage(cells, half_width=half_width).to(amplitude)
         amplitude, power = amplitude * inside, power * inside
-    weights = _map_weights_of(query, cells, half_width, count=count, spacing=spacing)
+
+    def weights(tau: float) -> MapWeights:
+        return _map_weights_at(query, tau, cells, half_width, count=count, spacing=spacing)
+
     return _Cells(amplitude, power, torch.stack(phases), torch.stack(factors).to(query.dtype), weights)
 
 
-def _map_weights_of(query: Query, cells: int, half_width: float, *, count: int, spacing: float) -> MapWeights:
-    tau = float(query.tau.detach())
+def _map_weights_at(
+    query: Query, tau: float, cells: int, half_width: float, *, count: int, spacing: float
+) -> MapWeights:
     # inside a block a pixel's edge moves by up to k w a tau / 2d / blocks of phase at the corner of pupil and window
     wavenumber = 2 * math.pi / float(query.wavelengths.min())
     a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
-    blocks = math.ceil(wavenumber * query.half_window * a * tau / (2 * d) / _BLOCK_PHASE) if tau else 1
+    own = 0.0 if query.paraxial else (a / d) ** 2
+    blocks = max(1, math.ceil(wavenumber * query.half_window * a * own / (2 * d) / _BLOCK_PHASE))
     return map_weights(
         cells,
         half_width=half_width,
         count=count,
         tau=tau,
-        blocks=max(1, min(_MAX_BLOCKS, blocks)),
+        blocks=min(_MAX_BLOCKS, blocks),
         spacing=spacing,
         dtype=query.dtype,
     ).to(query.device)
+
+
+def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: float) -> Tensor:
+    """evaluate(tau), with the gradient to tau by a central difference where tau has one (value unchanged).
+
+    tau moves edges on the image-side grid by up to 0.19 tau semi-apertures: the step moves them by a twentieth of a
+    sample.
+    """
+    value = evaluate(float(tau.detach()))
+    if not (tau.requires_grad and torch.is_grad_enabled()):
+        return value
+    step = 0.05 * spacing / 0.19
+    with torch.no_grad():
+        slope = (evaluate(float(tau) + step) - evaluate(float(tau) - step)) / (2 * step)
+    return value + ((tau - tau.detach()) * slope).to(value)
+
+
+def _pixel_field(query: Query, cells: _Cells, *, spacing: float) -> Pair:
+    """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (L, N, N)."""
+
+    def both(tau: float) -> Tensor:
+        return torch.stack(_PixelField.apply(cells.phases, cells.factors, cells.amplitude, cells.weights(tau)))
+
+    re, im = _following(query.tau, both, spacing=spacing)
+    return re, im
 
 
 class _PixelField(torch.autograd.Function):

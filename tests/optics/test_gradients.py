@@ -173,14 +173,14 @@ def test_width_of_a_square_aperture_beside_a_doe(propagator: str) -> None:
     check(function, torch.tensor(1.4 * mm, dtype=torch.float64), scale=1.4 * mm)
 
 
-def test_diameter_beside_a_doe_of_its_own_pitch() -> None:
-    """The map stays where it is while the aperture grows over it."""
-    doe = optics.DOE(noise(5, 5), pitch=0.35 * mm)
-
-    def function(diameter: Tensor) -> Tensor:
-        return psf(aperture(diameter), LENS, doe, propagator="fresnel", method="matrix")
-
-    check(function, torch.tensor(1.4 * mm, dtype=torch.float64), scale=1.4 * mm)
+def test_a_trainable_aperture_over_a_doe_of_its_own_pitch_is_refused() -> None:
+    """The map would have to stay where it is while the aperture grows over it: an error, not a wrong gradient."""
+    diameter = nn.Parameter(torch.tensor(1.4 * mm, dtype=torch.float64))
+    lens = optics.Lens(
+        optics.CircularAperture(diameter), LENS, optics.DOE(noise(5, 5), pitch=0.35 * mm), sensor_distance=FOCAL
+    )
+    with pytest.raises(ValueError, match="pitch of its own does not follow a trainable aperture.*leave pitch=None"):
+        lens.psf([550 * nm], distances=math.inf, pixel_pitch=9 * um, shape=(5, 5))
 
 
 def test_point_samples_have_gradients_too() -> None:

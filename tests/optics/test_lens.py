@@ -54,9 +54,11 @@ def test_focus_wavelength_sets_the_sensor() -> None:
 
 
 def test_powers_of_elements_add() -> None:
-    elements = optics.ThinLens(100 * mm), optics.ThinLens(100 * mm), optics.Defocus(0.5)
+    elements = optics.ThinLens(100 * mm), optics.ThinLens(200 * mm), optics.Defocus(0.5)
     lens = optics.Lens(optics.CircularAperture(2 * mm), *elements, focus_distance=math.inf)
-    assert lens.focal_length() == pytest.approx(1 / (20 - 0.5), rel=1e-14)
+    # a deliberate defocus is not focused away
+    assert lens.focal_length() == pytest.approx(1 / 15, rel=1e-14)
+    assert lens.sensor_distance == pytest.approx(1 / 15, rel=1e-14)
 
 
 def test_training_the_lens_does_not_move_the_sensor() -> None:
@@ -102,10 +104,8 @@ def test_mtf_of_a_perfect_lens_is_the_discs_overlap_times_the_pixel(pitch: float
         return overlap * np.sinc(fx * pitch) * np.sinc(fy * pitch)
 
     fx, fy = np.meshgrid(f, f)
-    # what is sampled at 1/pitch folds back: the nearest orders hold all that is left within the cut-off of 182 /mm
-    folded = sum(expected(fx + i / pitch, fy + j / pitch) for i in (-1, 0, 1) for j in (-1, 0, 1))
     # the window leaves out 2 N lambda / pi^2 w = 0.2 % of the light, which dents the MTF around frequency 0
-    error = np.abs(mtf - np.abs(folded)).max()
+    error = np.abs(mtf - np.abs(expected(fx, fy))).max()
     print(f"MTF at {pitch / um:.0f} um: {error:.1e}")
     assert error < 2.5e-3
 
@@ -256,5 +256,5 @@ def test_the_corners_of_a_square_aperture_must_stay_on_the_surface_too() -> None
 
 
 def test_a_parameter_in_millimetres_is_named_as_a_number() -> None:
-    with pytest.raises(ValueError, match=r"diameter 5 m is no aperture.*did you mean 5\.0? \* mm"):
+    with pytest.raises(ValueError, match=r"diameter 5 m is no aperture.*did you mean 5 \* mm"):
         optics.CircularAperture(nn.Parameter(torch.tensor(5.0)))
