@@ -1,5 +1,6 @@
 """Wave optics: from a point of light to its image on the sensor, and from a scene to the light in each pixel."""
 
+from kcam.optics.batch import batch_psf
 from kcam.optics.elements import (
     DOE,
     AnnularAperture,
@@ -36,5 +37,6 @@ __all__ = [
     "ThinLens",
     "ZernikeAberration",
     "ZernikeDOE",
+    "batch_psf",
     "refractive_index",
 ]

@@ -472,7 +472,7 @@ WINDOW_LENSES = {
     "zernike": (lambda: lens(optics.ZernikeDOE(2 * random(12, seed=4) - 1)), 2.0),
     "smooth DOE": (
         lambda: lens(
-            optics.DOE(20 * torch.sin(torch.linspace(-3, 3, 800).double())[:, None] * torch.ones(800).double())
+            optics.DOE(12 * torch.sin(torch.linspace(-3, 3, 800).double())[:, None] * torch.ones(800).double())
         ),
         2.0,
     ),
