@@ -488,6 +488,21 @@ def _always(query: Query) -> str | None:
     return None
 
 
+def _needs_fine_points(query: Query) -> str | None:
+    """An FFT as long as its pupil has bins lambda d / 2a apart; coarser points would fold the pupil onto itself."""
+    finest = (
+        float(query.wavelengths.min())
+        * float(query.sensor_distance.detach())
+        / (2 * float(query.image_side_semi_aperture.detach()))
+    )
+    if query.integrate or query.pixel_pitch < 0.9 * finest:
+        return None
+    return (
+        f"cannot place its bins on points {query.pixel_pitch:g} m apart (needs less than {0.9 * finest:.3g} m); use "
+        "method='matrix', or integrate over the pixels."
+    )
+
+
 def _needs_symmetry(query: Query) -> str | None:
     if query.lens.symmetric:
         return None
@@ -519,7 +534,7 @@ def _rows() -> dict[tuple[str, str], Propagator]:
                     function=_grid_function(method),
                     error=_grid_error,
                     cost=cost,
-                    valid=_always,
+                    valid=_needs_fine_points if method == "fft" else _always,
                     paraxial=paraxial,
                 )
             )

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from kcam.optics import sampling
 from kcam.optics.pupil import (
+    EDGE_MARGIN,
     MapWeights,
     Pupil,
     disc_coverage,
@@ -167,7 +168,7 @@ def ray_displacement(query: Query) -> Tensor:
             x, y = side, torch.zeros_like(side)
         else:
             x, y = side[None, :], side[:, None]
-        coarse = _replace_vergences(query, extremes)
+        coarse = replace(query, vergences=extremes)
         coefficients, maps = residual_path(coarse, query.pupil(x, y))
         inside = (query.pupil(x, y).rho2 <= 1.0001) | (not query.lens.round)
         step = float(side[1] - side[0]) * float(query.semi_aperture)
@@ -176,18 +177,6 @@ def ray_displacement(query: Query) -> Tensor:
         slope2 = torch.where(inside.flatten(), slope2, slope2.new_zeros(()))
         slope = slope2.amax(dim=1).sqrt().view(query.wavelengths.numel(), -1).amax(dim=1)
         return (slope * query.sensor_distance).cpu()
-
-
-def _replace_vergences(query: Query, vergences: Tensor) -> Query:
-    return replace(query, vergences=vergences)
-
-
-def aperture_energy(query: Query) -> Tensor:
-    """E: light through the aperture relative to its bounding square's area times the on-axis irradiance, (Z,) float64.
-
-    Only used by propagators that do not sum it on their own grid.
-    """
-    return torch.as_tensor(query.lens.aperture.open_share(), dtype=torch.float64) * torch.ones_like(query.vergences)
 
 
 # ---- propagation on a Cartesian pupil grid -----------------------------------------------------------------------
@@ -258,19 +247,14 @@ def _grid_group(
 
     spacing, length = grid_spacing(count), 0
     if method == "fft":
-        scale = float(scales[0].detach())
-        extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]]))
-        length = fast_length(max(math.ceil(extent / step), 2 * reach + 1))
-        spacing = 2 * math.pi / (length * scale * step)
-        count = 2 * math.ceil(1 / spacing + 6)
-        length = max(length, fast_length(count))
-        spacing = 2 * math.pi / (length * scale * step)
-        count = min(2 * math.ceil(1 / spacing + 6), length)
+        scale_step = float(scales[0].detach()) * step
+        extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]])) / step
+        count, length, spacing = _fft_grid(scale_step, shortest=max(math.ceil(extent), 2 * reach + 1))
     nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
 
     x, y = from_image_side(nodes[None, :].to(query.device), nodes[:, None].to(query.device), query.tau)
     pupil = query.pupil(x, y)
-    coefficients, maps = residual_path(_replace_wavelengths(query, query.wavelengths[members]), pupil)
+    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
     cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
     amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing)
     field = None if cells is None else _pixel_field(query, cells, spacing=spacing)
@@ -296,8 +280,17 @@ def _grid_group(
     return to_pixels(intensity, query, per_pixel=per_pixel, reach=reach) * factor[..., None, None].to(query.dtype)
 
 
-def _replace_wavelengths(query: Query, wavelengths: Tensor) -> Query:
-    return replace(query, wavelengths=wavelengths)
+def _fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:
+    """(pupil samples, length, spacing) of the FFT whose bins fall on the points: spacing = 2 pi / (length * s *
+    step).
+    """
+    length = fast_length(shortest)
+    while True:
+        spacing = 2 * math.pi / (length * scale_step)
+        count = 2 * math.ceil(1 / spacing + EDGE_MARGIN)
+        if count <= length:
+            return count, length, spacing
+        length = fast_length(count)  # a longer transform has finer samples, and so more of them
 
 
 def _amplitude(

@@ -349,3 +349,11 @@ def test_transforms_agree_where_only_the_transform_differs() -> None:
         for physics in ("nonparaxial", "fresnel"):
             matrix, chirp = (PROPAGATORS[physics, m](q) for m in ("matrix", "chirp_z"))
             assert l1(chirp, matrix) < 1e-11  # the same sum, in another order
+
+
+def test_fft_refuses_points_that_its_bins_cannot_reach() -> None:
+    lens = optics.Lens(optics.CircularAperture(5e-3), optics.ThinLens(50e-3), focus_distance=math.inf)
+    arguments = {"distances": math.inf, "pixel_pitch": 20e-6, "shape": (9, 9), "integrate": False}
+    with pytest.raises(ValueError, match=r"cannot place its bins on points 2e-05 m apart .*method='matrix'"):
+        lens.psf([550e-9], method="fft", **arguments)
+    assert torch.isfinite(lens.psf([550e-9], method="matrix", **arguments)).all()
