@@ -35,7 +35,8 @@ class Contestant:
 
     who: for the table. call: what is timed. check: errors of its result against the float64 reference, by name.
     dtype: of the result. default: whether it is what kcam does unless told. share: part of the whole work that `call`
-    does (a loop over a fair sample of the wavelengths, say); its time is divided by it.
+    does (a loop over a fair sample of the wavelengths, say); its time is divided by it. once: it is there for its
+    error, and too slow to be timed more than once.
     """
 
     who: str
@@ -44,6 +45,7 @@ class Contestant:
     dtype: str = "float32"
     default: bool = False
     share: float = 1.0
+    once: bool = False
 
     @property
     def ours(self) -> bool:
@@ -56,7 +58,7 @@ def race(
 ) -> list[dict[str, Any]]:
     """Time the contestants side by side; the first is the baseline that all ratios refer to.
 
-    Args:      op, size, direction: for the rows. seconds: roughly how long the rounds may take; at least 3 rounds
+    Args:      op, size, direction: for the rows. seconds: roughly how long the rounds may take; at least 3 of them
                (1 where seconds is 0), after a warm-up in which memory and errors are measured.
     Returns:   a row for each contestant: its time, the ratio of times (baseline over it), its errors, and the ratio of
                errors (the best baseline's over it, the least over the kinds of error that are called l1).
@@ -83,23 +85,25 @@ def race(
         )
         del result
         once.append(_cpu_time(contestant.call) if contestant.ours else first_call)
-    repeats = [
-        1 if not c.ours else max(1, min(5, int(0.25 * once[0] / t))) for c, t in zip(contestants, once, strict=True)
-    ]
+    repeats = [0 if c.once else max(1, min(5, int(0.25 * once[0] / t))) for c, t in zip(contestants, once, strict=True)]
     round_time = sum(t * r for t, r in zip(once, repeats, strict=True))
     rounds = max(3, min(most_rounds, int(seconds / round_time))) if seconds else 1
-    times: list[list[list[float]]] = [[] for _ in contestants]
+    times: list[list[list[float]]] = [
+        [] if not c.once else [[t / c.share]] for c, t in zip(contestants, once, strict=True)
+    ]
     for _ in range(rounds):
         for own, contestant, count in zip(times, contestants, repeats, strict=True):
-            own.append([_cpu_time(contestant.call) / contestant.share for _ in range(count)])
+            if count:
+                own.append([_cpu_time(contestant.call) / contestant.share for _ in range(count)])
     for row, own in zip(rows, times, strict=True):
         every = [t for part in own for t in part]
-        ratios = [statistics.median(base) / statistics.median(part) for base, part in zip(times[0], own, strict=True)]
+        # zip: a contestant that is timed once meets the first round alone
+        ratios = [statistics.median(base) / statistics.median(part) for base, part in zip(times[0], own, strict=False)]
         row["seconds"] = statistics.median(every)
         row["seconds_iqr"] = np.percentile(every, [25, 75]).tolist()
         row["ratio"] = statistics.median(ratios)
         row["ratio_iqr"] = np.percentile(ratios, [25, 75]).tolist()
-        row["rounds"], row["calls"] = rounds, len(every)
+        row["rounds"], row["calls"] = len(own), len(every)
         row["error_ratio"] = None if row["baseline"] else _error_ratio(row, rows)
     return rows
 

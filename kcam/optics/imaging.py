@@ -9,6 +9,8 @@ scene's factors, and back once per channel, not once per band.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 BORDERS = ("reflect", "replicate", "periodic", "zero")
 OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
+_BANDS_AT_ONCE = 4  # at most, in the buffer of a contraction: small enough to stay in the processor's cache
 _COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
 
 
@@ -232,93 +235,215 @@ class _Renderer:
         picture: tuple[int, int],
     ) -> None:
         self.imaging, self.psfs, self.spectra, self.weights = imaging, psfs, spectra, weights
-        self.picture = picture
-        border_after = imaging.border != "zero"  # zeros may share their place with those before the picture
-        self.size = tuple(
-            fast_length(n + m - 1 if border_after else n + m // 2)
-            for n, m in zip(picture, psfs.shape[-2:], strict=True)
+        after = imaging.border != "zero"  # zeros may share their place with those before the picture
+        size = tuple(
+            fast_length(n + m - 1 if after else n + m // 2) for n, m in zip(picture, psfs.shape[-2:], strict=True)
+        )
+        plane = 4 * size[0] * size[1] * psfs.element_size()
+        self.plan = _Convolution(
+            picture=picture,
+            window=tuple(psfs.shape[-2:]),
+            border=imaging.border,
+            size=size,
+            bands=max(1, min(_BANDS_AT_ONCE, int(imaging.max_memory // plane))),
         )
 
     def blur(self, planes: Tensor, *, layer: int) -> Tensor:
         """The scene's planes (B, K, H, W) through the PSFs of one layer: (B, C, H, W)."""
-        spectrum = self._transform(planes)
         psfs = self.psfs[layer]
         if self.weights is None:
-            return self._per_band(spectrum, psfs)
+            return self._per_band(planes, psfs)
         if self.spectra is not None and self.weights.shape[0] * self.spectra.shape[0] <= psfs.shape[0]:
-            kernels = torch.einsum("cl,kl,lyx->ckyx", self.weights, self.spectra, psfs)
-            return self._back(self._apply_kernels(spectrum, kernels))
-        return self._back(self._contract(spectrum, psfs, layer))
+            return self._by_kernels(planes, psfs)
+        kept = self._kept(psfs, (), lambda: self.plan.transfer(psfs))
+        return _Contraction.apply(planes, psfs, self.spectra, self.weights, kept, self.plan)
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How a layer's mask (B, 1, H, W) spreads in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
         psfs = self.psfs[layer]
         kernels = psfs if self.weights is None else torch.einsum("cl,lyx->cyx", self.weights, psfs)
         kernels = kernels / kernels.sum((-2, -1), keepdim=True)
-        return self._back(self._transform(share) * self._transfer(kernels))
+        return self.plan.back(self.plan.transform(share) * self.plan.transfer(kernels))
 
-    def _transform(self, planes: Tensor) -> Tensor:
-        return torch.fft.rfft2(_extend(planes, self.psfs.shape[-2:], self.imaging.border), s=self.size)
+    def _per_band(self, planes: Tensor, psfs: Tensor) -> Tensor:
+        """Each band by itself, for a sensor that sees all bands."""
 
-    def _transfer(self, kernels: Tensor) -> Tensor:
-        """Conjugate transfer functions: the picture is upright, which turns the PSF by 180 degrees (a correlation)."""
-        along_x = torch.fft.rfft(kernels, n=self.size[1])  # only the kernel's own rows, before the zero rows
-        return torch.fft.fft(along_x, n=self.size[0], dim=-2).conj()
+        def band(planes: Tensor, psf: Tensor, index: int) -> Tensor:
+            plane = (
+                planes[:, index]
+                if self.spectra is None
+                else torch.einsum("bkhw,k->bhw", planes, self.spectra[:, index])
+            )
+            return self.plan.back(self.plan.transform(plane) * self.plan.transfer(psf))
 
-    def _back(self, spectrum: Tensor) -> Tensor:
-        picture = torch.fft.irfft2(spectrum, s=self.size)
-        return picture[..., : self.picture[0], : self.picture[1]]
+        # between the forward and the backward pass only the results are kept, not 28 spectra
+        bands = (
+            checkpoint(band, planes, psfs[i], i, use_reentrant=False)
+            if torch.is_grad_enabled()
+            else band(planes, psfs[i], i)
+            for i in range(psfs.shape[0])
+        )
+        return torch.stack(list(bands), dim=1)
 
-    def _per_band(self, spectrum: Tensor, psfs: Tensor) -> Tensor:
-        parts = []
-        for part in self._parts(spectrum, psfs.shape[0]):
-            bands = spectrum[:, part] if self.spectra is None else _mix(self.spectra[:, part].T, spectrum)
-            parts.append(self._back(bands * self._transfer(psfs[part])))
-        return torch.cat(parts, dim=1)
+    def _by_kernels(self, planes: Tensor, psfs: Tensor) -> Tensor:
+        """sum_k (sum_l kappa_cl S_kl h_l) * C_k: for few channels and planes the PSFs are contracted, not the
+        spectra.
+        """
 
-    def _apply_kernels(self, spectrum: Tensor, kernels: Tensor) -> Tensor:
-        """sum_k T_ck C_k, one channel at a time."""
-        return torch.stack([(spectrum * self._transfer(channel)).sum(1) for channel in kernels], dim=1)
+        def transfers() -> Tensor:
+            return self.plan.transfer(torch.einsum("cl,kl,lyx->ckyx", self.weights, self.spectra, psfs))
 
-    def _contract(self, spectrum: Tensor, psfs: Tensor, layer: int) -> Tensor:
-        """sum_l kappa_cl H_l (sum_k S_kl C_k), split over the bands to stay within the memory."""
-        parts = self._parts(spectrum, psfs.shape[0])
-        transfers = self._kept_transfers(psfs, layer) if len(parts) == 1 else None
+        kept = self._kept(psfs, (self.weights, self.spectra), transfers)
+        spectrum = self.plan.transform(planes)
+        channels = transfers() if kept is None else kept
+        return torch.stack([self.plan.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
 
-        def accumulate(spectrum: Tensor, psfs: Tensor, weights: Tensor, part: list[int]) -> Tensor:
-            bands = spectrum[:, part] if self.spectra is None else _mix(self.spectra[:, part].T, spectrum)
-            transfer = self._transfer(psfs[part]) if transfers is None else transfers
-            return _mix(weights[:, part], bands * transfer)
-
-        total = None
-        for part in parts:
-            arguments = (spectrum, psfs, self.weights, part)
-            split = len(parts) > 1 and torch.is_grad_enabled()
-            value = checkpoint(accumulate, *arguments, use_reentrant=False) if split else accumulate(*arguments)
-            total = value if total is None else total + value
-        return total
-
-    def _kept_transfers(self, psfs: Tensor, layer: int) -> Tensor | None:
-        """Transfer functions of all bands, kept between calls while the PSFs are the same and small enough."""
-        size = psfs.shape[0] * self.size[0] * self.size[1] * psfs.element_size()
-        if psfs.requires_grad or self.psfs.shape[0] > 1 or size > self.imaging.max_memory / 4:
+    def _kept(self, psfs: Tensor, others: tuple[Tensor, ...], build: Callable[[], Tensor]) -> Tensor | None:
+        """Transfer functions kept between calls while what they come from is the same, or None: too large, or
+        training.
+        """
+        count = psfs.shape[0] if not others else others[0].shape[0] * others[1].shape[0]
+        size = count * self.plan.size[0] * self.plan.size[1] * psfs.element_size()
+        trained = any(t.requires_grad for t in (psfs, *others))
+        if trained or self.psfs.shape[0] > 1 or size > self.imaging.max_memory / 4:
             return None
-        return self.imaging._transfer_cache.get((psfs, self.size), lambda: self._transfer(psfs))
-
-    def _parts(self, spectrum: Tensor, bands: int) -> list[list[int]]:
-        """Bands in groups whose transforms fit into max_memory."""
-        plane = spectrum.shape[-2] * spectrum.shape[-1] * spectrum.element_size()
-        per_band = plane * (3 * spectrum.shape[0] + 2)
-        left = self.imaging.max_memory - plane * spectrum.shape[0] * spectrum.shape[1]
-        length = max(1, min(bands, int(left // per_band)))
-        return [list(range(start, min(start + length, bands))) for start in range(0, bands, length)]
+        return self.imaging._transfer_cache.get((psfs, *others, self.plan.size), build)
 
 
-def _mix(weights: Tensor, spectrum: Tensor) -> Tensor:
-    """Real weights (C, L) on complex planes (B, L, ...): one real matrix product."""
-    flat = torch.view_as_real(spectrum).flatten(2)
-    mixed = torch.matmul(weights, flat)
-    return torch.view_as_complex(mixed.view(spectrum.shape[0], weights.shape[0], *spectrum.shape[2:], 2))
+@dataclass(frozen=True)
+class _Convolution:
+    """Sizes of a convolution by FFT, and its parts.
+
+    The picture is upright, which turns the PSF by 180 degrees: a correlation, so transfer functions are conjugated,
+    and the window's origin needs no shift: the picture is extended by window // 2 before its first pixel.
+    """
+
+    picture: tuple[int, int]
+    window: tuple[int, int]
+    border: str
+    size: tuple[int, int]
+    bands: int  # at once
+
+    def transform(self, planes: Tensor) -> Tensor:
+        """Spectrum of planes (..., H, W) with their border."""
+        return torch.fft.rfft2(_extend(planes, self.window, self.border), s=self.size)
+
+    def transfer(self, kernels: Tensor) -> Tensor:
+        """Conjugate transfer functions of kernels (..., h, w)."""
+        along_x = torch.fft.rfft(kernels, n=self.size[1])  # only the kernel's own rows, before the zero rows
+        # conjugated in memory: a lazy conjugate would be copied at every product
+        return torch.fft.fft(along_x, n=self.size[0], dim=-2).conj_physical_()
+
+    def back(self, spectrum: Tensor) -> Tensor:
+        """The picture of a spectrum."""
+        return torch.fft.irfft2(spectrum, s=self.size)[..., : self.picture[0], : self.picture[1]]
+
+
+class _Contraction(torch.autograd.Function):
+    """sum_l kappa_cl H_l (sum_k S_kl C_k), a few bands at a time in one small buffer; nothing but the inputs is kept.
+
+    All bands at once would take hundreds of megabytes, and most of the time would go into touching them first.
+    """
+
+    @staticmethod
+    def forward(ctx, planes, psfs, spectra, weights, kept, plan):
+        ctx.save_for_backward(planes, psfs, spectra, weights, kept)
+        ctx.plan = plan
+        batch, bands, channels = planes.shape[0], psfs.shape[0], weights.shape[0]
+        factors = None if spectra is None else plan.transform(planes)
+        result = []
+        for b in range(batch):
+            total = planes.new_zeros(channels, 2 * plan.size[0] * (plan.size[1] // 2 + 1))
+            buffer = planes.new_empty(plan.bands, plan.size[0], plan.size[1] // 2 + 1, 2)
+            for start in range(0, bands, plan.bands):
+                part = range(start, min(start + plan.bands, bands))
+                for slot, index in enumerate(part):
+                    spectrum = _band_spectrum(plan, planes, spectra, factors, b, index)
+                    transfer = _band_transfer(plan, psfs, kept, index)
+                    torch.mul(spectrum, transfer, out=torch.view_as_complex(buffer[slot]))
+                total.addmm_(weights[:, part.start : part.stop], buffer[: len(part)].flatten(1))
+            result.append(plan.back(torch.view_as_complex(total.view(channels, plan.size[0], -1, 2))))
+        return torch.stack(result)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        planes, psfs, spectra, weights, kept = ctx.saved_tensors
+        plan = ctx.plan
+        need_planes, need_psfs, need_spectra, need_weights = ctx.needs_input_grad[:4]
+        height, width = plan.window
+        factors = None if spectra is None else plan.transform(planes)
+        d_planes = torch.zeros_like(planes) if need_planes else None
+        d_factors = torch.zeros_like(factors) if need_planes and spectra is not None else None
+        d_psfs = torch.zeros_like(psfs) if need_psfs else None
+        d_spectra = torch.zeros_like(spectra) if need_spectra and spectra is not None else None
+        d_weights = torch.zeros_like(weights) if need_weights else None
+        with full_precision(grad.device):
+            for b in range(planes.shape[0]):
+                # the adjoint of cropping is a picture with nothing around it; of a correlation, a convolution
+                onto = torch.fft.rfft2(grad[b], s=plan.size)
+                flat = torch.view_as_real(onto).flatten(1)
+                for index in range(psfs.shape[0]):
+                    mixed = (weights[:, index] @ flat).view(*onto.shape[1:], 2)
+                    mixed = torch.view_as_complex(mixed)
+                    transfer = _band_transfer(plan, psfs, kept, index)
+                    if need_planes or need_spectra:
+                        d_band = mixed * transfer.conj()
+                        if spectra is None and need_planes:
+                            extended = torch.fft.irfft2(d_band, s=plan.size)
+                            d_planes[b, index] = _extend_adjoint(extended, plan)
+                        if d_factors is not None:
+                            d_factors[b].add_(spectra[:, index, None, None] * d_band)
+                        if d_spectra is not None:
+                            d_spectra[:, index] += _inner(factors[b], d_band, plan)
+                    if need_psfs or need_weights:
+                        spectrum = _band_spectrum(plan, planes, spectra, factors, b, index)
+                        if need_psfs:
+                            d_psf = torch.fft.irfft2(spectrum * mixed.conj(), s=plan.size)
+                            d_psfs[index] += d_psf[:height, :width]
+                        if need_weights:
+                            d_weights[:, index] += _inner(onto, spectrum * transfer, plan)
+            if d_factors is not None:
+                d_planes = _extend_adjoint(torch.fft.irfft2(d_factors, s=plan.size), plan)
+        return d_planes, d_psfs, d_spectra, d_weights, None, None
+
+
+def _band_spectrum(
+    plan: _Convolution, planes: Tensor, spectra: Tensor | None, factors: Tensor | None, b: int, index: int
+) -> Tensor:
+    if spectra is None:
+        return plan.transform(planes[b, index])
+    mixed = spectra[:, index] @ torch.view_as_real(factors[b]).flatten(1)
+    return torch.view_as_complex(mixed.view(*factors.shape[2:], 2))
+
+
+def _band_transfer(plan: _Convolution, psfs: Tensor, kept: Tensor | None, index: int) -> Tensor:
+    return plan.transfer(psfs[index]) if kept is None else kept[index]
+
+
+def _inner(a: Tensor, b: Tensor, plan: _Convolution) -> Tensor:
+    """Sum over the picture's plane of two real functions, from their half spectra (C, ...) and (...), by Parseval."""
+    product = a.real * b.real + a.imag * b.imag
+    double = product.new_full((product.shape[-1],), 2.0)
+    double[0] = 1.0
+    if plan.size[1] % 2 == 0:
+        double[-1] = 1.0
+    return (product * double).sum((-2, -1)) / (plan.size[0] * plan.size[1])
+
+
+def _extend_adjoint(extended: Tensor, plan: _Convolution) -> Tensor:
+    """Transpose of `_extend` and of the zeros up to the transform's length: fold the border back onto the picture."""
+    for dim, n, m in zip((-2, -1), plan.picture, plan.window, strict=True):
+        before, after = m // 2, (m - 1) // 2
+        if plan.border == "zero":
+            extended = extended.narrow(dim, before, n)
+            continue
+        index = _border_index(torch.arange(-before, n + after, device=extended.device), n, plan.border)
+        shape = list(extended.shape)
+        shape[dim] = n
+        used = extended.narrow(dim, 0, n + before + after)
+        extended = extended.new_zeros(shape).index_add_(dim, index, used)
+    return extended
 
 
 def _extend(planes: Tensor, window: tuple[int, int], border: str) -> Tensor:

@@ -1,0 +1,354 @@
+"""What the README shows and nobody should type: its tables, what its code prints, and its pictures.
+
+    python docs/generate.py               writes the tables, and what the code blocks print
+    python docs/generate.py --pictures    renders the pictures too: a minute
+    python docs/generate.py --check       changes nothing; says what is out of step
+
+A table stands between ``<!-- generated: name -->`` and ``<!-- end -->``; what a ```python block prints stands in the
+```text block that follows it. `tests/test_readme.py` fails where the README and this script disagree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import math
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from PIL import Image  # noqa: E402
+
+from kcam import Camera, Scene, demo, optics, plots  # noqa: E402
+from kcam.optics.propagation import choose  # noqa: E402
+from kcam.optics.psf import Query  # noqa: E402
+from kcam.units import mm, nm, um  # noqa: E402
+
+README = ROOT / "README.md"
+RESULTS = ROOT / "benchmarks" / "results"
+
+# ---- the propagators -------------------------------------------------------------------------------------------------
+
+PHYSICS = {
+    "nonparaxial": "exact spheres on both sides, pupil in direction cosines",
+    "fresnel": "paraxial, equation (3.4): the thesis's model",
+    "angular_spectrum": "band-limited, from the plane behind the lens",
+    "geometric": "rays, no diffraction",
+    "reference": "float64, slow by design",
+}
+METHODS = {
+    "nonparaxial/matrix": "split matrix triple product",
+    "nonparaxial/chirp_z": "Bluestein's FFTs onto the pixels",
+    "nonparaxial/fft": "one FFT on a grid scaled to the pixels",
+    "nonparaxial/radial": "one Hankel transform",
+    "fresnel/matrix": "the same four",
+    "fresnel/chirp_z": "",
+    "fresnel/fft": "",
+    "fresnel/radial": "",
+    "angular_spectrum/fft": "FFT; an error above a grid of 8192",
+    "geometric/rays": "splatted onto the pixels",
+    "reference/quadrature": "polar quadrature; a fine grid for flat pixels",
+}
+
+
+def cases() -> dict[str, Query]:
+    """What the table states errors for: a window of 297 x 297 pixels, light of 550 nm, an object at 2 m."""
+    sphere = optics.PlanoConvexLens(25.8 * mm, glass="N-BK7")
+    doe = optics.DOE(torch.zeros(891, 891))
+    small, large = (optics.CircularAperture(width) for width in (5 * mm, 10 * mm))
+    lenses = {
+        "singlet f/10": (optics.Lens(small, sphere, focus_distance=2.0), 3 * um),
+        "singlet f/5": (optics.Lens(large, sphere, focus_distance=2.0), 3 * um),
+        "phone f/1.8": (Camera.phone()[0].lens, 1.4 * um),
+        "f/10 and a DOE": (optics.Lens(small, sphere, doe, focus_distance=2.0), 3 * um),
+    }
+    return {
+        name: lens.query([550 * nm], distances=2.0, pixel_pitch=pitch, shape=(297, 297))
+        for name, (lens, pitch) in lenses.items()
+    }
+
+
+def propagators_table() -> str:
+    """`optics.PROPAGATORS` as a table: errors and costs are what the rows themselves state."""
+    queries = cases()
+    default = {name: choose(query) for name, query in queries.items()}
+    first = next(iter(queries.values()))
+    cheapest = min(row.cost(first) for row in optics.PROPAGATORS.values() if row.exact)
+    lines = [
+        f"| `propagator=` | `method=` | {' | '.join(queries)} | cost |",
+        "|---|---|" + "---:|" * (len(queries) + 1),
+    ]
+    shown = set()
+    for row in optics.PROPAGATORS.values():
+        cells = []
+        for name, query in queries.items():
+            error = "refuses" if row.valid_for(query) is not None else scientific(row.error(query))
+            cells.append(f"**{error}**" if default[name] is row else error)
+        physics = "" if row.physics in shown else f"`{row.physics}`: {PHYSICS[row.physics]}"
+        shown.add(row.physics)
+        how = METHODS[f"{row.physics}/{row.method}"]
+        method = f"`{row.method}`" + (f": {how}" if how else "")
+        lines.append(f"| {physics} | {method} | {' | '.join(cells)} | {row.cost(first) / cheapest:.0f} |")
+    return "\n".join(lines)
+
+
+def scientific(value: float) -> str:
+    """Two figures, as 3e-05 is easier to read: 0.0031, 3.1e-5."""
+    if value >= 1e-3:
+        return f"{value:.2g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+# ---- the benchmarks --------------------------------------------------------------------------------------------------
+
+
+def benchmarks_table() -> str:
+    """Every default of kcam against the baseline of its race, from benchmarks/results/*.json: losses are bold."""
+    files = sorted(RESULTS.glob("*.json"))
+    parts = [benchmark_part(json.loads(path.read_text()), path) for path in files]
+    return "\n\n".join(part for part in parts if part) or "*Not measured yet: `make bench` writes the results.*"
+
+
+def benchmark_part(content: dict[str, Any], path: Path) -> str:
+    """The table of one file of results; nothing for a file without rows."""
+    rows = content.get("rows", [])
+    if not rows or "op" not in rows[0]:
+        return ""
+    lines = [
+        "| task | | textbook: time, error, memory | kcam: time, error, memory | faster | closer |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    shown = set()
+    tasks = list(dict.fromkeys(row["op"] for row in rows))
+    for row in sorted(rows, key=lambda row: tasks.index(row["op"])):
+        if row["baseline"] or not row["default"]:
+            continue
+        base = next(other for other in rows if _race(other) == _race(row) and other["baseline"])
+        task = "" if row["op"] in shown else f"{row['op']}<br><sub>{row['size']}</sub>"
+        shown.add(row["op"])
+        direction = "with gradient" if "backward" in row["direction"] else "forward"
+        ratio, closer = figures(row["ratio"]), row["error_ratio"]
+        lines.append(
+            f"| {task} | `{row['who'].removeprefix('kcam ')}`, {direction} | {measured(base)} | {measured(row)} "
+            f"| {f'**{ratio}**' if row['ratio'] < 1 else ratio} | {'' if closer is None else figures(closer)} |"
+        )
+    environment = content["environment"]
+    lines += [
+        "",
+        f"<sub>[`{path.name}`]({path.relative_to(ROOT)}): {environment['machine']}, {environment['threads']} thread, "
+        f"torch {environment['versions']['torch']}, {environment['date'][:10]}; {environment['clock']}. A time after ~ "
+        "was measured on a sample of the wavelengths and scaled up, and its memory is the sample's. Memory is the "
+        "peak beyond what was in use before.</sub>",
+    ]
+    verdicts = content.get("targets", [])
+    if verdicts:
+        lines += ["", "Against the targets that we had set:", ""]
+    for target in dict.fromkeys(verdict["target"] for verdict in verdicts):
+        own = [verdict for verdict in verdicts if verdict["target"] == target]
+        met, ratios = sum(verdict["met"] for verdict in own), [verdict["ratio"] for verdict in own]
+        outcome = "met" if met == len(own) else "**missed**, met" if not met else "**missed in part**, met"
+        lines.append(
+            f"- {target}: {outcome} in {met} of {len(own)} races; {figures(min(ratios))} to "
+            f"{figures(max(ratios))} times as fast."
+        )
+    return "\n".join(lines)
+
+
+def _race(row: dict[str, Any]) -> tuple[str, str]:
+    return row["op"], row["direction"]
+
+
+def measured(row: dict[str, Any]) -> str:
+    """Time, error and memory of a row in one cell."""
+    seconds = row["seconds"]
+    time = f"{figures(seconds * 1e3)} ms" if seconds < 1 else f"{figures(seconds)} s"
+    error = row["error"].get("l1_median", row["error"].get("relative_max"))
+    memory = row.get("peak_memory")
+    cells = [
+        ("~" if row.get("share_timed", 1.0) < 1 else "") + time,
+        "" if error is None else scientific(error),
+        "" if memory is None else f"{figures(memory / 1e6)} MB",
+    ]
+    return ", ".join(cell for cell in cells if cell)
+
+
+def figures(value: float) -> str:
+    """Two figures, as one says them: 0.56, 4.4, 61, 180, 54 000."""
+    if value >= 100:
+        step = 10 ** (math.floor(math.log10(value)) - 1)
+        return f"{round(value / step) * step:,}".replace(",", " ")
+    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+
+TABLES: dict[str, Callable[[], str]] = {"propagators": propagators_table, "benchmarks": benchmarks_table}
+
+# ---- the README ------------------------------------------------------------------------------------------------------
+
+TABLE = re.compile(r"(<!-- generated: (\w+) -->\n)(?:(?!<!--).)*(<!-- end -->)", re.DOTALL)
+CODE = re.compile(r"(```python\n(?P<code>.*?)```\n)(?:\n?```text\n(?P<output>.*?)```\n)?", re.DOTALL)
+
+
+def with_tables(text: str) -> str:
+    """The README with its tables made anew."""
+    return TABLE.sub(lambda match: f"{match[1]}{TABLES[match[2]]()}\n{match[3]}", text)
+
+
+@contextlib.contextmanager
+def inside(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Work in a folder for a while."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def run_code(text: str) -> Iterator[tuple[re.Match[str], str]]:
+    """Run the README's code in order, in one namespace; gives each block and what it printed."""
+    namespace: dict[str, Any] = {}
+    for match in CODE.finditer(text):
+        printed = io.StringIO()
+        line = text.count("\n", 0, match.start("code"))
+        code = compile("\n" * line + match["code"], str(README), "exec")  # errors name the README's own lines
+        with contextlib.redirect_stdout(printed):
+            exec(code, namespace)
+        yield match, printed.getvalue()
+
+
+def with_output(text: str) -> str:
+    """The README with what its code prints printed anew."""
+    result, end = [], 0
+    for match, printed in run_code(text):
+        shown = f"\n```text\n{printed}```\n" if printed else ""
+        result += [text[end : match.start()], match[1], shown]
+        end = match.end()
+    return "".join(result) + text[end:]
+
+
+# ---- the pictures ----------------------------------------------------------------------------------------------------
+
+DISTANCES = (2.1, 2.3, 3.0, 5.0)
+COLOURS = (450 * nm, 550 * nm, 650 * nm)
+
+
+def overview(path: Path) -> None:
+    """A scene, the lens's PSFs, the raw mosaic and the picture, each with a detail."""
+    camera, scene = demo.singlet(), Scene.builtin("motorcycle")
+    with torch.no_grad():
+        _, raw, picture = demo.shoot(camera, scene)
+        psf = camera[0].lens.psf(COLOURS, distances=DISTANCES, pixel_pitch=4 * um, shape=(41, 41)).double()
+    _, height, width = scene.shape
+    side, gap, edge, head = 2.12, 0.08, 0.02, 0.26
+    tall, detail = side * height / width, side * 0.66
+    row, column = 166, 536  # of the detail's centre: the headlight
+    columns = 56
+    rows = round(columns * detail / side)
+    sheet = plots.Sheet(4 * side + 3 * gap + 2 * edge, head + tall + gap + detail + edge)
+    coloured = plots.false_colour(raw[0], plots.mosaic_tile(camera))
+    # twice, for the pixels of one colour are dark between the others: the mean over four is what an eye would see
+    cells = coloured[: height // 2 * 2, : width // 2 * 2].reshape(height // 2, 2, width // 2, 2, 3).mean((1, 3))
+    panels = {
+        0: ("Scene: 28 bands, with depth", plots.as_image(scene.to_srgb()[0]), plots.as_image(scene.to_srgb()[0])),
+        2: ("Raw: mosaic, noise, 12 bits", np.clip(1.8 * cells, 0, 1), np.clip(1.2 * coloured, 0, 1)),
+        3: ("Picture", plots.as_image(picture[0]), plots.as_image(picture[0])),
+    }
+    top = max(0, row - rows // 2)
+    left = max(0, column - columns // 2)
+    for index, (title, whole, pixels) in panels.items():
+        x = edge + index * (side + gap)
+        sheet.text(x, head - 0.06, title, weight="bold", va="bottom", size=9.5)
+        axes = sheet.picture(whole, x, head, side, tall)
+        scale = whole.shape[1] / width
+        for line, colour in ((2.2, "black"), (1.0, "white")):
+            axes.plot(
+                np.array([0, 1, 1, 0, 0]) * columns * scale + left * scale,
+                np.array([0, 0, 1, 1, 0]) * rows * scale + top * scale,
+                lw=line,
+                color=colour,
+            )
+        axes.set(xlim=(-0.5, whole.shape[1] - 0.5), ylim=(whole.shape[0] - 0.5, -0.5))
+        crop = pixels[top : top + rows, left : left + columns]
+        sheet.picture(crop, x, head + tall + gap, side, detail, smooth=False)
+    _psf_panel(sheet, psf, left=edge + side + gap, top=head, side=side, tall=tall + gap + detail)
+    save_jpeg(sheet.figure, path)
+
+
+def _psf_panel(sheet: plots.Sheet, psf: torch.Tensor, *, left: float, top: float, side: float, tall: float) -> None:
+    """PSFs in the colour of their light, distance by wavelength."""
+    sheet.text(left, top - 0.06, "Lens: its PSFs", weight="bold", va="bottom", size=9.5)
+    gap = 0.03
+    cell_w = (side - gap * (len(COLOURS) - 1)) / len(COLOURS)
+    cell_h = (tall - gap * (len(DISTANCES) - 1)) / len(DISTANCES)
+    half = psf.shape[-1] // 2
+    reach = min(half, math.floor(half * cell_w / cell_h)) if cell_w < cell_h else half
+    lit = plots.light_colours(torch.tensor(COLOURS, dtype=torch.float64))
+    for d, distance in enumerate(DISTANCES):
+        for c, wavelength in enumerate(COLOURS):
+            image = psf[d, c, :, half - reach : half + reach + 1][..., None].numpy() * lit[c] ** 2.2
+            image = np.sqrt(image / image.max()) ** (1 / 1.1)
+            x, y = left + c * (cell_w + gap), top + d * (cell_h + gap)
+            sheet.picture(image, x, y, cell_w, cell_h, smooth=False)
+            if d == 0:
+                name = f"{wavelength / nm:.0f} nm"
+                sheet.text(x + cell_w - 0.05, y + 0.05, name, size=7.5, colour="white", ha="right")
+            if c == 0:
+                name = plots.metres(distance)
+                sheet.text(x + 0.05, y + cell_h - 0.05, name, size=7.5, colour="white", va="bottom")
+
+
+def gallery(path: Path) -> None:
+    """What examples/psf_gallery.py draws."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    import psf_gallery
+
+    save_jpeg(psf_gallery.figure(psf_gallery.gallery()), path, resolution=200)
+
+
+def save_jpeg(figure: Any, path: Path, *, resolution: float = 200, largest: int = 400_000) -> None:
+    """A figure as a JPEG of at most `largest` bytes, with its colours at full resolution."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=resolution, facecolor="white", format="png")
+    picture = Image.open(content).convert("RGB")
+    for quality in (92, 88, 84, 80, 75, 70):
+        picture.save(path, quality=quality, subsampling=0, optimize=True)
+        if path.stat().st_size < largest:
+            return
+    raise ValueError(f"{path.name} has {path.stat().st_size} bytes at quality {quality}; expected < {largest}.")
+
+
+PICTURES: dict[str, Callable[[Path], None]] = {"overview.jpg": overview, "psf_gallery.jpg": gallery}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--pictures", action="store_true", help="render the pictures too")
+    parser.add_argument("--check", action="store_true", help="change nothing; exit with 1 if something is out of step")
+    options = parser.parse_args(arguments)
+    before = README.read_text()
+    with tempfile.TemporaryDirectory() as folder, inside(folder):
+        after = with_output(with_tables(before))
+    if options.check:
+        sys.stdout.write("in step\n" if after == before else "out of step: run python docs/generate.py\n")
+        return int(after != before)
+    README.write_text(after)
+    for name, draw in PICTURES.items() if options.pictures else ():
+        draw(README.parent / "docs" / name)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,369 @@
+"""The README says what is so: its code prints what it shows, its tables are generated, its claims have tests."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+import typer
+from PIL import Image
+
+import kcam
+from kcam import cli, demo, isp, optics, sensor
+from kcam.camera import PRESETS
+from kcam.scene import BUILTIN
+from kcam.sensor.colour_filter import fitted
+from kcam.units import um
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+EXAMPLES = {
+    "train_doe": ["--steps", "4", "--out", "doe.png"],
+    "compose_camera": ["--size", "40", "--out", "cameras.png"],
+    "psf_gallery": ["--pixels", "21", "--out", "gallery.png"],
+}
+
+
+def load(path: Path) -> ModuleType:
+    """A script as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+generate = load(ROOT / "docs" / "generate.py")
+
+
+def section(title: str) -> str:
+    """What stands under a heading."""
+    return re.split(r"\n##+ ", README.split(f"# {title}\n", 1)[1])[0]
+
+
+def code_blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def code_lines(block: str) -> int:
+    return sum(bool(line.strip()) for line in block.splitlines())
+
+
+# ---- code --------------------------------------------------------------------------------------------------------
+
+
+def same_but_for_rounding(printed: str, shown: str) -> bool:
+    """Words alike, numbers within 2 %: rounding differs between machines, and with it a photon here and there."""
+    if NUMBER.sub("#", printed) != NUMBER.sub("#", shown):
+        return False
+    pairs = zip(NUMBER.findall(printed), NUMBER.findall(shown), strict=True)
+    return all(float(a) == pytest.approx(float(b), rel=0.02, abs=1e-3) for a, b in pairs)
+
+
+def test_comparison_sees_what_differs() -> None:
+    assert same_but_for_rounding("f = 49.8 mm", "f = 49.9 mm")
+    assert not same_but_for_rounding("f = 49.8 mm", "f = 59.8 mm")
+    assert not same_but_for_rounding("f = 49.8 mm", "f = 49.8 um")
+    assert not same_but_for_rounding("1 2", "1")
+
+
+def test_code_prints_what_the_readme_shows(tmp_path: Path) -> None:
+    with generate.inside(tmp_path):
+        blocks = list(generate.run_code(README))
+    assert len(blocks) == len(code_blocks("python")) >= 6
+    for match, printed in blocks:
+        assert same_but_for_rounding(printed, match["output"] or ""), f"{match['code']}\nprints\n{printed}"
+
+
+def test_the_first_code_is_the_camera_of_the_picture() -> None:
+    code = code_blocks("python")[0]
+    assert "size=180" in code
+    namespace: dict[str, object] = {}
+    exec(code.replace("size=180", "size=40").split("print(")[0], namespace)
+    scene = kcam.Scene.builtin("motorcycle", size=40)
+    with torch.no_grad():
+        one, two = (c(scene, generator=torch.Generator().manual_seed(0)) for c in (namespace["camera"], demo.singlet()))
+    torch.testing.assert_close(one, two, rtol=0, atol=0.02)  # an electron more or less where rounding decides
+
+
+def test_the_first_code_has_fifteen_lines_and_the_training_twelve() -> None:
+    assert code_lines(code_blocks("python")[0]) <= 15
+    training = re.search(r"```python\n(.*?)```", section("Training a diffractive element"), re.DOTALL)
+    assert training is not None
+    assert code_lines(training[1]) <= 12
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    module = load(ROOT / "examples" / f"{name}.py")
+    with generate.inside(tmp_path):
+        module.main(EXAMPLES[name])
+        assert Path(EXAMPLES[name][-1]).stat().st_size > 1000
+    printed = capsys.readouterr().out
+    assert EXAMPLES[name][-1] in printed
+    assert "False" not in printed
+
+
+def test_all_examples_are_run() -> None:
+    assert {path.stem for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
+
+
+@pytest.mark.slow
+def test_training_brings_depth_of_field() -> None:
+    module = load(ROOT / "examples" / "train_doe.py")
+    before, after, losses = module.train()
+    assert losses[-1] < 0.85 * losses[0]
+    # measured: 29 to 46 % of the light in the central 3 x 3 pixels at the worst of five distances
+    worst = [float(module.light_in_the_middle(psf).min()) for psf in (before, after)]
+    assert worst[0] < 0.3
+    assert worst[1] > 0.4
+
+
+# ---- the shell ---------------------------------------------------------------------------------------------------
+
+
+def shell_commands() -> list[str]:
+    lines = [line.split("#")[0].strip() for block in code_blocks("sh") for line in block.splitlines()]
+    inline = re.findall(r"`(kcam [a-z-].*?)`", README)
+    return list(dict.fromkeys(line for line in lines + inline if line))
+
+
+@pytest.mark.parametrize("line", shell_commands())
+def test_shell_command_exists(line: str) -> None:
+    program, *arguments = shlex.split(line.removeprefix(".venv/bin/"))
+    makefile = (ROOT / "Makefile").read_text()
+    if program == "make":
+        assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in arguments)
+    elif program == "kcam":
+        main = typer.main.get_command(cli.app)
+        if arguments[0].startswith("--"):
+            assert arguments[0] in {"--help"} | {option for p in main.params for option in p.opts}
+            return
+        command = main.commands[arguments[0]]  # type: ignore[attr-defined]
+        known = {option: parameter for parameter in command.params for option in parameter.opts}
+        for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
+            if option.startswith("--"):
+                assert option in known or option == "--help"
+                assert option != "--camera" or value in PRESETS
+    elif program == "pip":
+        assert (ROOT / arguments[arguments.index("--constraint") + 1]).is_file()
+        pins = (ROOT / "constraints.txt").read_text().splitlines()
+        assert all(argument in pins for argument in arguments if "==" in argument)
+    else:
+        assert (program, arguments) == ("python3", ["-m", "venv", ".venv"]), "a command that no test knows"
+
+
+def test_make_targets_in_the_text_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    prose = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+    targets = set(re.findall(r"`make ([a-z-]+)`", prose))
+    assert targets
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets), targets
+
+
+# ---- tables and pictures -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", generate.TABLES)
+def test_generated_table_is_in_step(name: str) -> None:
+    found = re.search(rf"<!-- generated: {name} -->\n(.*?)\n<!-- end -->", README, re.DOTALL)
+    assert found is not None, f"the README has no block {name}"
+    assert found[1] == generate.TABLES[name](), "run python docs/generate.py"
+
+
+def test_every_propagator_is_in_the_table() -> None:
+    table = generate.propagators_table()
+    assert len(table.splitlines()) == 2 + len(optics.PROPAGATORS)
+    assert all(f"`{physics}`" in table and f"`{method}`" in table for physics, method in optics.PROPAGATORS)
+
+
+def race(who: str, ratio: float, error: float, **rest: object) -> dict[str, object]:
+    row = {"op": "task", "who": who, "direction": "forward", "size": "1", "baseline": False, "default": True}
+    return row | {"error": {"l1_median": error}, "seconds": 0.1, "ratio": ratio, "error_ratio": 3.0} | rest
+
+
+def test_benchmark_table_shows_losses_and_missed_targets() -> None:
+    content = {
+        "environment": {"machine": "m", "threads": 1, "versions": {"torch": "2"}, "date": "2026-01-01T0", "clock": "c"},
+        "targets": [
+            {"target": "twice as fast", "op": "task", "direction": "forward", "who": "kcam a", "met": False,
+             "ratio": 0.5, "error_ratio": None},
+            {"target": "easy", "op": "task", "direction": "forward", "who": "kcam a", "met": True, "ratio": 2.0,
+             "error_ratio": None},
+        ],
+        "rows": [
+            race("textbook", 1.0, 0.1, baseline=True, default=False, share_timed=0.1, peak_memory=53_600_000),
+            race("kcam a", 0.5, 2e-5),
+            race("kcam b", 0.4, 1e-5, default=False),
+        ],
+    }  # fmt: skip
+    table = generate.benchmark_part(content, generate.RESULTS / "x.json")
+    assert "| task<br><sub>1</sub> | `a`, forward | ~100 ms, 0.1, 54 MB | 100 ms, 2.0e-5 | **0.5** | 3 |" in table
+    assert "`b`" not in table
+    assert "- twice as fast: **missed**, met in 0 of 1 races; 0.5 to 0.5 times as fast." in table
+    assert "- easy: met in 1 of 1 races; 2 to 2 times as fast." in table
+    assert generate.benchmark_part({"other": 1}, generate.RESULTS / "x.json") == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.5597, "0.56"), (4.395, "4.4"), (60.75, "61"), (99.7, "100"), (176.0, "180"), (54_250.0, "54 000")],
+)
+def test_figures(value: float, text: str) -> None:
+    assert generate.figures(value) == text
+
+
+def test_links_and_pictures_exist() -> None:
+    prose = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+    targets = {target for target in re.findall(r"\]\(([^)#]+)\)", prose) if "://" not in target}
+    assert {"docs/overview.jpg", "docs/psf_gallery.jpg", "CHANGELOG.md", "LICENSE"} <= targets
+    assert not [target for target in targets if not (ROOT / target).exists()]
+
+
+@pytest.mark.parametrize("name", generate.PICTURES)
+def test_pictures_are_small_and_sharp_enough(name: str) -> None:
+    path = ROOT / "docs" / name
+    assert f"(docs/{name})" in README
+    assert path.stat().st_size < 400_000
+    with Image.open(path) as picture:
+        assert 1200 <= picture.width <= 2000
+
+
+def test_paths_in_the_layout_exist() -> None:
+    lines = section("Where to find things").split("```")[1].splitlines()[1:]
+    assert len(lines) > 10
+    for line in lines:
+        path, what = line.split(maxsplit=1)
+        assert (ROOT / path).exists(), path
+        if path == "examples/":
+            assert all((ROOT / path / name.strip()).exists() for name in what.split(","))
+    parts = list((ROOT / "kcam").iterdir())
+    modules = {path.name for path in parts if path.suffix == ".py" or (path / "__init__.py").exists()}
+    shown = {Path(line.split()[0]).name for line in lines if line.startswith("kcam/")}
+    unimportant = {"__init__.py", "__main__.py", "cache.py", "context.py", "demo.py", "ste.py"}
+    assert modules - unimportant <= shown, "the layout leaves out a module"
+
+
+# ---- claims ------------------------------------------------------------------------------------------------------
+
+
+def quoted_tests() -> list[tuple[str, str]]:
+    links = re.findall(r"\[`(test_\w+)`\]\((tests/[\w/]+\.py)\)", README)
+    comments = [(name, path) for path, name in re.findall(r"(tests/[\w/]+\.py)::(test_\w+)", README)]
+    return sorted(set(links + comments))
+
+
+def test_every_quoted_test_exists() -> None:
+    assert len(quoted_tests()) > 20
+    for name, path in quoted_tests():
+        tree = ast.parse((ROOT / path).read_text())
+        names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        assert name in names, f"{path} has no {name}"
+
+
+def test_every_claim_in_the_two_tables_names_its_test() -> None:
+    for line in section("What is exact, and what is approximate").splitlines():
+        if line.startswith("| ") and not line.startswith("| what"):
+            assert "[`test_" in line or "| below |" in line, line
+
+
+def source_of(name: str, path: str) -> str:
+    """A test with its decorators."""
+    text = (ROOT / path).read_text()
+    node = next(n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef) and n.name == name)
+    first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+    return "\n".join(text.splitlines()[first - 1 : node.end_lineno])
+
+
+def test_bounds_in_the_two_tables_are_those_of_the_tests() -> None:
+    checked = 0
+    for line in section("What is exact, and what is approximate").splitlines():
+        link = re.search(r"\[`(test_\w+)`\]\((tests/[\w/]+\.py)\)", line)
+        if link is None or not line.startswith("| ") or "glasses" in line:  # the glasses' are in the oracles
+            continue
+        source = source_of(link[1], link[2])
+        for bound in re.findall(r"\d+e-\d+|0\.\d{2,}", line.split("|")[2]):
+            assert bound in source, f"{link[1]} says nothing of {bound}"
+            checked += 1
+    assert checked > 15
+
+
+def test_stages_in_the_table_are_stages() -> None:
+    lens = optics.Lens(optics.CircularAperture(1e-3), optics.ThinLens(1e-2), focus_distance=1.0)
+    rows = re.findall(r"^\| `((?:optics|sensor|isp)\..*?)` \|", section("How a camera is composed"), re.MULTILINE)
+    names = {"optics": optics, "sensor": sensor, "isp": isp, "lens": lens, "um": um}
+    stages = [eval(row, names) for row in rows]
+    assert all(isinstance(stage, kcam.Stage) for stage in stages)
+    public = {
+        name for module in (optics, sensor, isp) for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, kcam.Stage) and name in module.__all__
+    }  # fmt: skip
+    assert public - {"Mean", "Clip"} == {type(stage).__name__ for stage in stages}, "a stage is missing"
+
+
+def test_names_in_the_text_are_all_there_are() -> None:
+    composed = section("How a camera is composed")
+    elements = set(re.findall(r"`(\w+)`", composed.split("Elements of a lens", 1)[1].split("\n\n", 1)[0]))
+    public = {
+        name for name, value in vars(optics).items()
+        if isinstance(value, type) and issubclass(value, optics.Element) and value is not optics.Element
+    }  # fmt: skip
+    assert public <= elements
+    assert f"({len(optics.GLASSES)} glasses" in composed
+    assert all(f"`{name}`" in composed for name in isp.DEMOSAICS)
+    assert all(f"`{name}`" in composed for name in sensor.PATTERNS if len(name) > 4 or name == "rgbw")
+    scenes = section("Photographs, cubes, charts").split("The built-in scenes", 1)[1]
+    assert set(re.findall(r"`(\w+)`", scenes)) == set(BUILTIN)
+    assert set(re.findall(r"^\| `Camera\.(\w+)\(\)`", README, re.MULTILINE)) == set(PRESETS)
+
+
+def test_filter_errors_are_those_of_the_fits() -> None:
+    text = " ".join(section("Limits").split())
+    for name, label in (("nikon_5100", "Nikon"), ("sigma_sd_merrill", "Sigma"), ("kodak", "Kodak")):
+        errors = ", ".join(f"{100 * error:.1f}" for error in fitted(name).errors)
+        assert f"{errors} % ({label})" in text
+
+
+def test_numbers_of_the_benchmarks_stand_in_the_readme() -> None:
+    table = section("Accuracy and speed")
+    for path in generate.RESULTS.glob("*.json"):
+        rows = json.loads(path.read_text()).get("rows", [])
+        ours = [row for row in rows if row.get("default")]
+        for row in ours:
+            assert generate.figures(row["ratio"]) in table
+            assert row["op"] in table
+        assert table.count("**0.") == sum(row["ratio"] < 1 for row in ours), "losses are bold"
+
+
+def test_colour_errors_are_those_that_the_test_asserts() -> None:
+    source = (ROOT / "tests" / "isp" / "test_isp_colour.py").read_text()
+    for name, label in (("nikon", "Nikon"), ("sigma", "Sigma"), ("kodak", "Kodak")):
+        found = re.search(rf'\("{name}", "D65", ([\d.]+), ([\d.]+)\)', source)
+        assert found is not None
+        assert f"{label} {float(found[1]):.1f} / {float(found[2]):.1f}" in README
+
+
+# ---- the changelog -----------------------------------------------------------------------------------------------
+
+
+def test_the_changelog_knows_this_version() -> None:
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    assert re.search(rf"^## {re.escape(kcam.__version__)}\b", changelog, re.MULTILINE)
+    assert "Lines of code" in changelog
+
+
+def test_the_random_state_is_left_alone_by_the_table() -> None:
+    state = torch.random.get_rng_state()
+    generate.propagators_table()
+    assert torch.equal(state, torch.random.get_rng_state())
