@@ -26,6 +26,7 @@ from kcam.optics.pupil import (
     disc_weights,
     from_image_side,
     grid_spacing,
+    map_onto,
     map_weights,
     pupil_tau,
     square_coverage,
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
 _BLOCK_PHASE = 0.03  # radians; 0.1 costs 2e-3 of the PSF, 0.02 1e-4
 _MAX_BLOCKS = 128
-_CELLS_PER_SAMPLE = 2.0  # at least, for each pupil sample: the rim cuts cells by their area
+_CELLS_PER_SAMPLE = 1.7  # at least, for each pupil sample: the rim cuts cells by their area
 _MOST_CELLS = 2048  # on which several maps are brought together exactly; beyond, by the nearest pixel
 
 
@@ -311,7 +312,7 @@ def _amplitude(
             weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
         transmission = power = unfold_quadrant(weights).to(query.device)
     else:
-        power = _following(query.tau, lambda tau: cells.weights(tau).forward(cells.power[None])[0], spacing=spacing)
+        power = _following(query.tau, lambda tau: map_onto(cells.power, cells.weights(tau)), spacing=spacing)
         power = power.to(torch.float64)
         transmission = torch.ones_like(power)
     amplitude, energy = transmission[None], power[None]
@@ -450,20 +451,33 @@ class _PixelField(torch.autograd.Function):
     def forward(ctx, phases, factors, amplitude, weights):
         ctx.save_for_backward(phases, factors, amplitude)
         ctx.weights = weights
-        angle = torch.einsum("el,eyx->lyx", factors, phases)
-        field = weights.forward(torch.cat([angle.cos(), angle.sin()]) * amplitude).unflatten(0, (2, -1))
-        return field[0], field[1]
+        parts: tuple[list[Tensor], list[Tensor]] = ([], [])
+        for factor in factors.T:
+            for part, values in zip(parts, _sines(factor, phases), strict=True):
+                part.append(weights.forward(values.mul_(amplitude)))
+        return torch.stack(parts[0]), torch.stack(parts[1])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_re, grad_im):
         phases, factors, amplitude = ctx.saved_tensors
-        onto = ctx.weights.adjoint(torch.cat([grad_re, grad_im])).unflatten(0, (2, -1))
-        angle = torch.einsum("el,eyx->lyx", factors, phases)
-        cosine, sine = angle.cos(), angle.sin()
-        d_phases = torch.einsum("el,lyx->eyx", factors, (cosine * onto[1] - sine * onto[0]) * amplitude)
-        d_amplitude = (cosine * onto[0] + sine * onto[1]).sum(0) if ctx.needs_input_grad[2] else None
+        d_phases = torch.zeros_like(phases)
+        d_amplitude = torch.zeros_like(amplitude)
+        for factor, re, im in zip(factors.T, grad_re, grad_im, strict=True):
+            onto_re, onto_im = ctx.weights.adjoint(re), ctx.weights.adjoint(im)
+            cosine, sine = _sines(factor, phases)
+            if ctx.needs_input_grad[2]:
+                d_amplitude += cosine * onto_re + sine * onto_im
+            d_angle = cosine.mul_(onto_im).sub_(sine.mul_(onto_re)).mul_(amplitude)
+            for d_phase, own in zip(d_phases, factor, strict=True):
+                d_phase.add_(d_angle * own)
         return d_phases, None, d_amplitude, None
+
+
+def _sines(factor: Tensor, phases: Tensor) -> Pair:
+    """Cosine and sine of sum_e factor_e * phase_e."""
+    angle = (factor[:, None, None] * phases).sum(0)
+    return angle.cos(), angle.sin()
 
 
 def to_pixels(intensity: Tensor, query: Query, *, per_pixel: float, reach: int) -> Tensor:

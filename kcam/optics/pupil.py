@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from torch import Tensor
 EDGE_MARGIN = 12  # samples of the grid beyond the rim, where low-passed edges still differ from zero
 _EDGE_HALF_WIDTH = 6  # samples; half width of the low-pass for edge weights
 _FINE = 5  # cells per sample in which the area of the rim is measured exactly
+_SLAB_COLUMNS = 32  # of a banded matrix: narrow enough to leave out most zeros, wide enough for a matrix product
 _MAP_HALF_WIDTH = 12  # samples; half width of the low-pass that brings a pixel map onto the pupil grid
 _MAP_BETA = 7.9  # 80 dB: passes 0.79 of the Nyquist frequency and stops from 1.21; kappa 2.5 needs 0.8 and 1.2
 
@@ -199,66 +201,50 @@ def pixel_weights(edges: Tensor, nodes: Tensor, *, spacing: float) -> Tensor:
 
 @dataclass(frozen=True)
 class _BandedMatrices:
-    """Matrices (n, N), one for each block of rows, kept as slabs of columns with the band of rows that they need."""
+    """Matrices (n, N), one for each block of rows, cut into slabs of columns with only the band of rows that they need.
 
-    slabs: Tensor  # (blocks, slabs, width, columns of a slab)
-    starts: tuple[int, ...]  # first input of each slab
+    slabs: (blocks, width, columns of the slab) each; starts: first row of each band.
+    """
+
+    slabs: tuple[Tensor, ...]
+    starts: tuple[int, ...]
     inputs: int
+    outputs: int
 
     @staticmethod
     def build(matrices: list[Tensor], *, dtype: torch.dtype) -> _BandedMatrices:
         """Cut the bands out of dense matrices, (n, N) each."""
         inputs, outputs = matrices[0].shape
-        count = next(c for c in range(max(1, outputs // 40), 0, -1) if outputs % c == 0)
-        used = torch.stack([m != 0 for m in matrices]).any(0).unflatten(1, (count, -1)).any(-1)  # (n, slabs)
-        rows = torch.arange(inputs)[:, None]
-        first = torch.where(used, rows, inputs).amin(0)
-        last = torch.where(used, rows, -1).amax(0)
-        width = max(1, int((last - first).max()) + 1)
-        starts = first.clamp(max=inputs - width).tolist()
-        column = outputs // count
-        slabs = [
-            torch.stack([m[at : at + width, i * column : (i + 1) * column] for i, at in enumerate(starts)]).to(dtype)
-            for m in matrices
-        ]
-        return _BandedMatrices(torch.stack(slabs), tuple(starts), inputs)
+        used = torch.stack([matrix != 0 for matrix in matrices]).any(0)
+        slabs, starts = [], []
+        for first in range(0, outputs, _SLAB_COLUMNS):
+            columns = slice(first, first + _SLAB_COLUMNS)
+            rows = used[:, columns].any(1).nonzero().flatten()
+            low, high = (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 1)
+            slabs.append(torch.stack([matrix[low:high, columns].to(dtype) for matrix in matrices]))
+            starts.append(low)
+        return _BandedMatrices(tuple(slabs), tuple(starts), inputs, outputs)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """(P, rows, n) -> (P, rows, N), each block of rows times its own matrix."""
-        stacked = self._stack(field)  # (blocks, planes * rows, n)
-        width = self.slabs.shape[2]
-        bands = torch.stack([stacked[..., at : at + width] for at in self.starts], dim=1)
-        product = torch.bmm(bands.flatten(0, 1), self.slabs.flatten(0, 1)).unflatten(0, self.slabs.shape[:2])
-        return self._unstack(product.transpose(1, 2).flatten(2), field.shape)
-
-    def adjoint(self, field: Tensor) -> Tensor:
-        """(P, rows, N) -> (P, rows, n), the transpose of `forward`."""
-        stacked = self._stack(field)
-        parts = stacked.unflatten(2, (len(self.starts), -1)).transpose(1, 2)
-        product = torch.bmm(parts.flatten(0, 1), self.slabs.flatten(0, 1).mT).unflatten(0, self.slabs.shape[:2])
-        total = field.new_zeros(*stacked.shape[:2], self.inputs)
-        width = self.slabs.shape[2]
-        for slab, at in enumerate(self.starts):
-            total[..., at : at + width] += product[:, slab]
-        return self._unstack(total, field.shape)
-
-    def _stack(self, field: Tensor) -> Tensor:
-        """Blocks first; the planes join the rows of a block, as broadcasting over them would copy the matrices."""
-        blocks = self.slabs.shape[0]
-        length = math.ceil(field.shape[1] / blocks)
-        if blocks * length != field.shape[1]:
-            field = torch.nn.functional.pad(field, (0, 0, 0, blocks * length - field.shape[1]))
-        return field.unflatten(1, (blocks, length)).transpose(0, 1).flatten(1, 2)
-
-    def _unstack(self, stacked: Tensor, shape: torch.Size) -> Tensor:
-        rows = stacked.unflatten(1, (shape[0], -1)).transpose(0, 1).flatten(1, 2)
-        return rows[:, : shape[1]]
+    def pieces(self, lines: int) -> Iterator[tuple[Tensor, slice, slice, slice]]:
+        """(matrix, its inputs, its outputs, the lines that it acts on), the lines in equal blocks."""
+        blocks = self.slabs[0].shape[0]
+        length = math.ceil(lines / blocks)
+        at = 0
+        for slab, start in zip(self.slabs, self.starts, strict=True):
+            for block in range(math.ceil(lines / length)):
+                matrix = slab[block]
+                yield (
+                    matrix,
+                    slice(start, start + matrix.shape[0]),
+                    slice(at, at + matrix.shape[1]),
+                    slice(block * length, min((block + 1) * length, lines)),
+                )
+            at += slab.shape[2]
 
 
 @dataclass(frozen=True)
 class MapWeights:
-    """Linear map from an n x n pixel map onto an N x N pupil grid: along the rows of the map, then along the grid's
-    columns.
+    """Linear map from an n x n pixel map onto an N x N pupil grid: along the map's rows, then along the grid's columns.
 
     In the paraxial plane one matrix each is exact. In the Debye plane the pixels' edges are curved, so the rows are
     taken in blocks thin enough that a pixel moves by less than a stated phase inside a block.
@@ -268,16 +254,51 @@ class MapWeights:
     along_y: _BandedMatrices
 
     def forward(self, field: Tensor) -> Tensor:
-        """(P, n, n) -> (P, N, N)."""
-        return self.along_y.forward(self.along_x.forward(field).mT).mT
+        """(n, n) -> (N, N)."""
+        half = field.new_empty(field.shape[0], self.along_x.outputs)
+        for matrix, source, target, rows in self.along_x.pieces(field.shape[0]):
+            torch.mm(field[rows, source], matrix, out=half[rows, target])
+        grid = field.new_empty(self.along_y.outputs, half.shape[1])
+        for matrix, source, target, columns in self.along_y.pieces(half.shape[1]):
+            torch.mm(matrix.T, half[source, columns], out=grid[target, columns])
+        return grid
 
     def adjoint(self, grid: Tensor) -> Tensor:
-        """(P, N, N) -> (P, n, n), the transpose of `forward`."""
-        return self.along_x.adjoint(self.along_y.adjoint(grid.mT).mT)
+        """(N, N) -> (n, n), the transpose of `forward`."""
+        half = grid.new_zeros(self.along_y.inputs, grid.shape[1])
+        for matrix, source, target, columns in self.along_y.pieces(grid.shape[1]):
+            half[source, columns].addmm_(matrix, grid[target, columns])
+        field = grid.new_zeros(half.shape[0], self.along_x.inputs)
+        for matrix, source, target, rows in self.along_x.pieces(half.shape[0]):
+            field[rows, source].addmm_(half[rows, target], matrix.T)
+        return field
 
     def to(self, device: torch.device) -> MapWeights:
         """The same map on another device."""
-        return MapWeights(*(replace(part, slabs=part.slabs.to(device)) for part in (self.along_x, self.along_y)))
+        return MapWeights(
+            *(
+                replace(part, slabs=tuple(slab.to(device) for slab in part.slabs))
+                for part in (self.along_x, self.along_y)
+            )
+        )
+
+
+class _MapOnto(torch.autograd.Function):
+    """`MapWeights.forward` with its adjoint."""
+
+    @staticmethod
+    def forward(ctx, field, weights):
+        ctx.weights = weights
+        return weights.forward(field)
+
+    @staticmethod
+    def backward(ctx, grad):
+        return ctx.weights.adjoint(grad), None
+
+
+def map_onto(field: Tensor, weights: MapWeights) -> Tensor:
+    """A map of pixels (n, n) on the pupil grid (N, N); differentiable in the map."""
+    return _MapOnto.apply(field, weights)
 
 
 def _block_centres(positions: Tensor, blocks: int) -> Tensor:
