@@ -38,7 +38,7 @@ test-all: $(VENV)/dev.stamp
 	$(PYTEST)
 
 bench: $(VENV)/dev.stamp
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.bench
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

@@ -28,7 +28,7 @@ def test_each_race_has_a_textbook_and_kcam_with_its_default(content):
     for row in content["rows"]:
         races.setdefault((row["op"], row["direction"]), []).append(row)
     assert {direction for _, direction in races} == {"forward", "forward + backward"}
-    assert len(races) == 5 + 6 + 8
+    assert len(races) == 5 + 6 + 12
     for rows in races.values():
         assert rows[0]["baseline"]
         assert rows[0]["ratio"] == 1
