@@ -46,7 +46,7 @@ lint: $(VENV)/dev.stamp
 types: $(VENV)/dev.stamp
 	$(BIN)/mypy
 
-check: lint test
+check: lint types test
 
 # The wheel, in an environment of its own and from another folder: tables, py.typed and dependencies are all inside.
 wheel-test: $(VENV)/core.stamp

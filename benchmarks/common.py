@@ -59,7 +59,7 @@ def race(
     """Time the contestants side by side; the first is the baseline that all ratios refer to.
 
     Args:      op, size, direction: for the rows. seconds: roughly how long the rounds may take; at least 3 of them
-               (2 if one takes longer, 1 where seconds is 0), after a warm-up, which gives memory and errors.
+               (1 where seconds is 0), after a warm-up, which gives memory and errors.
     Returns:   a row for each contestant: its time, the ratio of times (baseline over it), its errors, and the ratio of
                errors (the best baseline's over it, the least over the kinds of error that are called l1).
     """
@@ -87,7 +87,7 @@ def race(
         once.append(_cpu_time(contestant.call) if contestant.ours else first_call)
     repeats = [0 if c.once else max(1, min(5, int(0.25 * once[0] / t))) for c, t in zip(contestants, once, strict=True)]
     round_time = sum(t * r for t, r in zip(once, repeats, strict=True))
-    rounds = max(3 if round_time < seconds else 2, min(most_rounds, int(seconds / round_time))) if seconds else 1
+    rounds = max(3, min(most_rounds, int(seconds / round_time))) if seconds else 1
     times: list[list[list[float]]] = [
         [] if not c.once else [[t / c.share]] for c, t in zip(contestants, once, strict=True)
     ]

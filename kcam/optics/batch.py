@@ -75,7 +75,7 @@ def batch_psf(
         slopes = [
             (opd @ g.flatten(1)[:, inside]).square() for g in torch.gradient(coarse, spacing=2 / 64, dim=(-2, -1))
         ]
-        displacement = sum(slopes).sqrt().amax(dim=(1, 2)) * d / a
+        displacement = torch.stack(slopes).sum(0).sqrt().amax(dim=(1, 2)) * d / a
         widest = a / d
         half_window = (max(shape) // 2 + sampling.WINDOW_MARGIN) * pixel_pitch
         shortest = float(grid.min())

@@ -99,6 +99,7 @@ class CircularAperture(Aperture):
     """
 
     symmetric = True
+    diameter: Scalar
 
     def __init__(self, diameter: Scalar) -> None:
         super().__init__()
@@ -126,6 +127,7 @@ class AnnularAperture(Aperture):
     """
 
     symmetric = True
+    diameter: Scalar
 
     def __init__(self, diameter: Scalar, *, obscuration: float) -> None:
         super().__init__()
@@ -155,6 +157,8 @@ class SquareAperture(Aperture):
     Raises:  ValueError for a width that is not > 0, or is above 1 m.
     """
 
+    width: Scalar
+
     def __init__(self, width: Scalar) -> None:
         super().__init__()
         _check_aperture(width, name="width")
@@ -181,6 +185,9 @@ class ApertureMap(Aperture):
         width: side of the square that the map spans [m].
     Raises: ValueError for a map that is not square, leaves [0, 1], has NaN, or is closed everywhere.
     """
+
+    transmission: Tensor
+    width: Scalar
 
     def __init__(self, transmission: Tensor, *, width: Scalar) -> None:
         super().__init__()
@@ -222,6 +229,7 @@ class ThinLens(Element):
     """
 
     symmetric = True
+    focal_length: Scalar
 
     def __init__(self, focal_length: Scalar) -> None:
         super().__init__()
@@ -254,6 +262,7 @@ class PlanoConvexLens(Element):
     """
 
     symmetric = True
+    radius_of_curvature: Scalar
 
     def __init__(self, radius_of_curvature: Scalar, *, glass: str | float = "N-BK7") -> None:
         super().__init__()
@@ -284,6 +293,7 @@ class Defocus(Element):
 
     symmetric = True
     focuses = False
+    added_vergence: Scalar
 
     def __init__(self, vergence: Scalar) -> None:
         super().__init__()
@@ -313,6 +323,8 @@ class DOE(Element):
             through.
     Raises:  ValueError for a map that is not square or not finite, levels < 2, a wavelength not in metres.
     """
+
+    phase: Tensor
 
     def __init__(
         self,
@@ -359,6 +371,8 @@ class ZernikeDOE(Element):
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976); normalised on the circle of the semi-aperture.
     """
 
+    coefficients: Tensor
+
     def __init__(
         self, coefficients: Tensor, *, design_wavelength: float = 550e-9, glass: str | float = "fused silica"
     ) -> None:
@@ -382,6 +396,8 @@ class ZernikeAberration(Element):
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
 
+    coefficients: Tensor
+
     def __init__(self, coefficients: Tensor) -> None:
         super().__init__()
         _check_vector(coefficients, name="coefficients")
@@ -403,6 +419,7 @@ class RadialDOE(Element):
     """
 
     symmetric = True
+    profile: Tensor
 
     def __init__(
         self, profile: Tensor, *, design_wavelength: float = 550e-9, glass: str | float = "fused silica"

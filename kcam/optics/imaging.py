@@ -82,7 +82,7 @@ class Imaging(Stage):
         self.lens = lens
         self.pixel_pitch = check_pixel_pitch(pixel_pitch)
         self.propagator, self.method = propagator, method
-        self.psf_shape = None if psf_shape is None else tuple(psf_shape)
+        self.psf_shape = None if psf_shape is None else (int(psf_shape[0]), int(psf_shape[1]))
         self.layers, self.border, self.fill_factor = layers, border, fill_factor
         self.distance, self.max_memory = distance, float(max_memory)
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
@@ -127,7 +127,8 @@ class Imaging(Stage):
         blur = float((ray_displacement(query) + self.lens.pixel_phase_displacement(query)).max())
         tail = float(wavelengths.max()) * float(query.sensor_distance.detach()) / (2 * math.pi**2 * OUTSIDE_SHARE)
         half = math.ceil((blur + tail * self.lens.aperture.rim_per_area()) / self.pixel_pitch)
-        return tuple(min(2 * half + 1, n + (n + 1) % 2) for n in picture)
+        height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
+        return height, width
 
     def depth_layers(self, depth: Tensor, wavelengths: Tensor) -> Tensor:
         """Vergences of the layers that a depth map is cut into, ascending (Z,) [1/m]: equal steps of <= 0.125 waves.
@@ -236,13 +237,13 @@ class _Renderer:
     ) -> None:
         self.imaging, self.psfs, self.spectra, self.weights = imaging, psfs, spectra, weights
         after = imaging.border != "zero"  # zeros may share their place with those before the picture
-        size = tuple(
-            fast_length(n + m - 1 if after else n + m // 2) for n, m in zip(picture, psfs.shape[-2:], strict=True)
-        )
+        window = (psfs.shape[-2], psfs.shape[-1])
+        rows, columns = (fast_length(n + (m - 1 if after else m // 2)) for n, m in zip(picture, window, strict=True))
+        size = (rows, columns)
         plane = 4 * size[0] * size[1] * psfs.element_size()
         self.plan = _Convolution(
             picture=picture,
-            window=tuple(psfs.shape[-2:]),
+            window=window,
             border=imaging.border,
             size=size,
             bands=max(1, min(_BANDS_AT_ONCE, int(imaging.max_memory // plane))),
@@ -254,7 +255,7 @@ class _Renderer:
         if self.weights is None:
             return self._per_band(planes, psfs)
         if self.spectra is not None and self.weights.shape[0] * self.spectra.shape[0] <= psfs.shape[0]:
-            return self._by_kernels(planes, psfs)
+            return self._by_kernels(planes, psfs, self.weights, self.spectra)
         kept = self._kept(psfs, (), lambda: self.plan.transfer(psfs))
         return _Contraction.apply(planes, psfs, self.spectra, self.weights, kept, self.plan)
 
@@ -285,15 +286,15 @@ class _Renderer:
         )
         return torch.stack(list(bands), dim=1)
 
-    def _by_kernels(self, planes: Tensor, psfs: Tensor) -> Tensor:
+    def _by_kernels(self, planes: Tensor, psfs: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
         """sum_k (sum_l kappa_cl S_kl h_l) * C_k: for few channels and planes the PSFs are contracted, not the
         spectra.
         """
 
         def transfers() -> Tensor:
-            return self.plan.transfer(torch.einsum("cl,kl,lyx->ckyx", self.weights, self.spectra, psfs))
+            return self.plan.transfer(torch.einsum("cl,kl,lyx->ckyx", weights, spectra, psfs))
 
-        kept = self._kept(psfs, (self.weights, self.spectra), transfers)
+        kept = self._kept(psfs, (weights, spectra), transfers)
         spectrum = self.plan.transform(planes)
         channels = transfers() if kept is None else kept
         return torch.stack([self.plan.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
@@ -411,7 +412,7 @@ class _Contraction(torch.autograd.Function):
 def _band_spectrum(
     plan: _Convolution, planes: Tensor, spectra: Tensor | None, factors: Tensor | None, b: int, index: int
 ) -> Tensor:
-    if spectra is None:
+    if spectra is None or factors is None:
         return plan.transform(planes[b, index])
     mixed = spectra[:, index] @ torch.view_as_real(factors[b]).flatten(1)
     return torch.view_as_complex(mixed.view(*factors.shape[2:], 2))

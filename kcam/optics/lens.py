@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
-from kcam.optics.elements import Aperture, Element, Scalar, float64, set_scalar
+from kcam.optics.elements import Aperture, Element, PlanoConvexLens, Scalar, float64, set_scalar
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
@@ -32,6 +33,9 @@ class Lens(nn.Module):
         TypeError for something that is no element.
     """
 
+    elements: Sequence[Element]  # held by an nn.ModuleList
+    sensor_distance: Scalar
+
     def __init__(
         self,
         *elements: Element,
@@ -49,12 +53,12 @@ class Lens(nn.Module):
                 f"a lens has exactly one aperture, got {len(apertures)}; add CircularAperture(diameter=5 * mm) or "
                 "remove all but one."
             )
-        if (focus_distance is None) == (sensor_distance is None):
-            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
-        self.elements = nn.ModuleList(elements)
+        self.elements = nn.ModuleList(elements)  # type: ignore[assignment]
         self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
-        if focus_distance is not None:
+        if focus_distance is not None and sensor_distance is None:
             sensor_distance = self._sensor_distance_for(float(check_distances(focus_distance, name="focus_distance")))
+        elif focus_distance is not None or sensor_distance is None:
+            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
         check_positive(sensor_distance, name="sensor_distance")
         set_scalar(self, "sensor_distance", sensor_distance)
         self._check_curvature()
@@ -156,7 +160,7 @@ class Lens(nn.Module):
             integrate=integrate,
             dtype=dtype,
         )
-        return self._answer(query, propagator, method)
+        return choose(query, propagator=propagator, method=method)(query)
 
     def query(
         self,
@@ -208,26 +212,34 @@ class Lens(nn.Module):
         shape: tuple[int, int],
         propagator: str = "nonparaxial",
         method: str | None = None,
+        samples: int | None = None,
+        fill_factor: float = 1.0,
+        integrate: bool = True,
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:
         """Modulation transfer function, |OTF| / OTF(0) of the light in the window, times the pixel's own sinc.
 
+        Args: those of `psf`; integrate=False leaves out the pixel's sinc: the optics alone.
         Returns: (Z, L, H, W) in [0, 1]; index n // 2 is frequency 0, the step is 1 / (n * pixel_pitch) cycles per
             metre.
         """
-        query = self.query(wavelengths, distances=distances, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
+        query = self.query(
+            wavelengths,
+            distances=distances,
+            pixel_pitch=pixel_pitch,
+            shape=shape,
+            samples=samples,
+            fill_factor=fill_factor,
+            integrate=integrate,
+            dtype=dtype,
+        )
         curves = []
         for wavelength in query.wavelengths:
             # sampled finer than the pixels, and times the pixel's sinc: the pixels' own samples would alias
-            fine = 2 * math.ceil(query.evaluation_grid(float(wavelength))[0]) + 1
-            points = replace(
-                query,
-                wavelengths=wavelength[None],
-                pixel_pitch=query.pixel_pitch / fine,
-                shape=(shape[0] * fine, shape[1] * fine),
-                integrate=False,
-            )
-            otf = torch.fft.fftshift(torch.fft.fft2(self._answer(points, propagator, method)[:, 0]), dim=(-2, -1))
+            fine = 2 * _points_per_pixel(query, wavelength) + 1
+            points = _between_pixels(query, wavelength, fine=fine, shape=(shape[0] * fine, shape[1] * fine))
+            image = choose(points, propagator=propagator, method=method)(points)[:, 0]
+            otf = torch.fft.fftshift(torch.fft.fft2(image), dim=(-2, -1))
             magnitude2 = otf.real.square() + otf.imag.square()
             # a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
             modulation = torch.sqrt(magnitude2 + torch.finfo(dtype).tiny)
@@ -235,13 +247,11 @@ class Lens(nn.Module):
             for dim, n in zip((-2, -1), shape, strict=True):
                 modulation = modulation.narrow(dim, n * fine // 2 - n // 2, n)
                 frequency = (torch.arange(n, device=modulation.device) - n // 2) / n  # cycles per pixel
-                sinc = torch.sinc(frequency * query.active).abs().to(modulation)
-                modulation = modulation * (sinc[:, None] if dim == -2 else sinc)
+                if integrate:
+                    sinc = torch.sinc(frequency * query.active).abs().to(modulation)
+                    modulation = modulation * (sinc[:, None] if dim == -2 else sinc)
             curves.append(modulation / total)
         return torch.stack(curves, dim=1)
-
-    def _answer(self, query: Query, propagator: str, method: str | None) -> Tensor:
-        return choose(query, propagator=propagator, method=method)(query)
 
     def encircled_energy(
         self,
@@ -252,6 +262,9 @@ class Lens(nn.Module):
         shape: tuple[int, int],
         propagator: str = "nonparaxial",
         method: str | None = None,
+        samples: int | None = None,
+        fill_factor: float = 1.0,
+        integrate: bool = True,
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:
         """Share of the light through the aperture that falls within a circle around the origin.
@@ -259,22 +272,26 @@ class Lens(nn.Module):
         The irradiance is evaluated between the pixels, at a quarter of its Nyquist pitch, and summed with the edge
         weights of a disc: no pixel counts as a whole.
 
+        Args: those of `psf`; fill_factor and integrate change nothing, for the irradiance is what counts here.
         Returns: (Z, L, K + 1) for radii k * pixel_pitch, k = 0..K = min(H, W) // 2, rising from 0.
         """
         largest = min(shape) // 2
-        query = self.query(wavelengths, distances=distances, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
+        query = self.query(
+            wavelengths,
+            distances=distances,
+            pixel_pitch=pixel_pitch,
+            shape=shape,
+            samples=samples,
+            fill_factor=fill_factor,
+            integrate=integrate,
+            dtype=dtype,
+        )
         curves = []
         for wavelength in query.wavelengths:
-            fine = 3 * math.ceil(query.evaluation_grid(float(wavelength))[0])
+            fine = 3 * _points_per_pixel(query, wavelength)
             side = 2 * (largest * fine + 8) + 3
-            points = replace(
-                query,
-                wavelengths=wavelength[None],
-                pixel_pitch=query.pixel_pitch / fine,
-                shape=(side, side),
-                integrate=False,
-            )
-            image = self._answer(points, propagator, method)[:, 0]
+            points = _between_pixels(query, wavelength, fine=fine, shape=(side, side))
+            image = choose(points, propagator=propagator, method=method)(points)[:, 0]
             curves.append(torch.stack([_disc_sum(image, k * fine) for k in range(largest + 1)], dim=-1))
         return torch.stack(curves, dim=1)
 
@@ -328,7 +345,7 @@ class Lens(nn.Module):
     def _check_curvature(self) -> None:
         reach = float(self.aperture.semi_aperture().detach()) * (1 if self.round else math.sqrt(2))
         for element in self.elements:
-            if not hasattr(element, "radius_of_curvature"):
+            if not isinstance(element, PlanoConvexLens):
                 continue
             radius = float(float64(element.radius_of_curvature).detach())
             if reach >= radius:
@@ -336,6 +353,17 @@ class Lens(nn.Module):
                     f"the aperture reaches r = {reach:g} m, but the surface ends at its radius of curvature "
                     f"R = {radius:g} m (r >= R). Use an aperture below {2 * radius:g} m across or a larger R."
                 )
+
+
+def _points_per_pixel(query: Query, wavelength: Tensor) -> int:
+    """Whole points per pixel that sample the irradiance, whether or not the query integrates over its pixels."""
+    return math.ceil(replace(query, integrate=True).evaluation_grid(float(wavelength))[0])
+
+
+def _between_pixels(query: Query, wavelength: Tensor, *, fine: int, shape: tuple[int, int]) -> Query:
+    """The same question of one wavelength at points `fine` times as close, not integrated."""
+    pitch = query.pixel_pitch / fine
+    return replace(query, wavelengths=wavelength[None], pixel_pitch=pitch, shape=shape, integrate=False)
 
 
 def _disc_sum(image: Tensor, radius: int) -> Tensor:

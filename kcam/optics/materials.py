@@ -176,4 +176,5 @@ def refractive_index(glass: str | float, *, wavelengths: Tensor) -> Tensor:
             f"{low * 1e3:g}..{high * 1e3:g} nm ({entry.source}); choose another glass or a constant index."
         )
     x2 = micrometres**2
-    return torch.sqrt(1 + sum(b * x2 / (x2 - c) for b, c in zip(entry.b, entry.c, strict=True)))
+    resonances = (b * x2 / (x2 - c) for b, c in zip(entry.b, entry.c, strict=True))
+    return torch.sqrt(sum(resonances, torch.ones_like(x2)))

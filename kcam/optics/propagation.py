@@ -18,7 +18,7 @@ from torch.utils.checkpoint import checkpoint
 
 from kcam.optics import sampling
 from kcam.optics.psf import Query, grid_psf, grid_samples, ray_displacement, residual_path, to_pixels
-from kcam.optics.pupil import Pupil, disc_weights, from_image_side, unfold_quadrant
+from kcam.optics.pupil import Pupil, from_image_side, round_weights, unfold_quadrant
 from kcam.optics.transforms import fast_length
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
@@ -86,8 +86,8 @@ def _ring_nodes(query: Query, count: int) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights over the open part of the radius, image-side coordinates."""
     nodes, weights = (torch.as_tensor(v, device=query.device) for v in np.polynomial.legendre.leggauss(count))
     discs = query.lens.aperture.discs()
-    inner = discs[1][0] if len(discs) > 1 else 0.0
-    if inner:
+    inner = torch.zeros_like(query.tau) + (discs[1][0] if len(discs) > 1 else 0.0)
+    if len(discs) > 1:
         inner = inner * torch.sqrt((1 + query.tau) / (1 + query.tau * inner**2))
     return inner + (1 - inner) * (nodes + 1) / 2, weights * (1 - inner) / 2
 
@@ -109,7 +109,7 @@ def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: fl
     position = scale * torch.sqrt(radii2) * (query.pixel_pitch / per_pixel) / _TABLE_STEP
     low = torch.clamp(position.detach().floor().long() - 3, max=transformed.shape[-1] - 8)
     offset = position - low
-    value = 0.0
+    value = torch.zeros_like(transformed[..., low])
     for tap, weight in enumerate(_lagrange(offset)):
         value = value + weight * transformed[..., torch.abs(low + tap)]  # U is even in t
     intensity = value.square().sum(0).to(query.dtype)  # (Z, radii)
@@ -218,15 +218,23 @@ def _point_transmission(query: Query, pupil: Pupil, *, pitch: float, count: int)
     """
     aperture, a = query.lens.aperture, float(query.semi_aperture.detach())
     if not aperture.discs():
-        mask = aperture.pixel_map(query.wavelengths)
+        mask = _pixels(query).to(pupil.rho2)
         inside = (pupil.x.abs() <= 1) & (pupil.y.abs() <= 1)
-        values = _lookup(mask.values.to(pupil.rho2), None, pupil.x[0] * a, query.semi_aperture) * inside
+        values = _lookup(mask, None, pupil.x[0] * a, query.semi_aperture) * inside
         return values, values**2
     half = min(count // 2, math.ceil(a / pitch) + 8)
-    quadrant = sum(w * disc_weights(2 * half, spacing=pitch / a, radius=r) for r, w in aperture.discs())
+    quadrant = round_weights(aperture.discs(), 2 * half, spacing=pitch / a)
     margin = count // 2 - half
     weights = nn.functional.pad(unfold_quadrant(quadrant).to(query.device), (margin, margin, margin, margin))
     return weights, weights
+
+
+def _pixels(query: Query) -> Tensor:
+    """The transmission of an aperture that is a map of pixels."""
+    mask = query.lens.aperture.pixel_map(query.wavelengths)
+    if mask is None:
+        raise TypeError(f"{type(query.lens.aperture).__name__} has neither discs() nor a pixel_map().")
+    return mask.values
 
 
 def _lookup(values: Tensor, half_width, axis: Tensor, semi_aperture: Tensor) -> Tensor:
@@ -258,10 +266,10 @@ def geometric_psf(query: Query) -> Tensor:
         slopes = [torch.autograd.grad(m.sum(), (x, y), create_graph=True, allow_unused=True) for m in maps]
     slopes_x, slopes_y = (torch.stack([torch.zeros_like(x) if s[i] is None else s[i] for s in slopes]) for i in (0, 1))
     if query.lens.round:
-        quadrant = sum(w * disc_weights(count, spacing=spacing, radius=r) for r, w in query.lens.aperture.discs())
+        quadrant = round_weights(query.lens.aperture.discs(), count, spacing=spacing)
         power = unfold_quadrant(quadrant).to(query.device)
     else:
-        mask = query.lens.aperture.pixel_map(query.wavelengths).values.to(axis)
+        mask = _pixels(query).to(axis)
         power = _lookup(mask, None, axis * query.semi_aperture, query.semi_aperture) ** 2
     power = power.expand(query.vergences.numel(), count, count)
     if not query.paraxial:
@@ -328,21 +336,21 @@ def reference_psf(query: Query) -> Tensor:
         per_pixel, reach = query.evaluation_grid(wavelength)
         points = torch.arange(-reach, reach + 1, dtype=torch.float64, device=query.device)
         points = points * (query.pixel_pitch / per_pixel) * scale
-        image = sum(_direct_sums(field, points, xi, eta))
+        image = _direct_intensity(field, points, xi, eta)
         factor = (a * query.pixel_pitch / (wavelengths[index] * d)) ** 2 / energy
         bands.append(to_pixels(image, query, per_pixel=per_pixel, reach=reach) * factor[:, None, None])
     return torch.stack(bands, dim=1).to(dtype)
 
 
-def _direct_sums(field: Tensor, points: Tensor, xi: Tensor, eta: Tensor) -> tuple[Tensor, Tensor]:
-    """Re^2 and Im^2 of sum_p field_p exp(-i (x xi_p + y eta_p)) at all pairs of points."""
+def _direct_intensity(field: Tensor, points: Tensor, xi: Tensor, eta: Tensor) -> Tensor:
+    """|sum_p field_p exp(-i (x xi_p + y eta_p))|^2 at all pairs of points."""
     total = field.new_zeros(field.shape[0], points.numel(), points.numel())
     for part in torch.arange(xi.numel(), device=xi.device).split(16_384):
         along_x, along_y = points[:, None] * xi[part], points[:, None] * eta[part]
         kernel_x = torch.complex(along_x.cos(), -along_x.sin())
         kernel_y = torch.complex(along_y.cos(), -along_y.sin())
         total = total + (kernel_y * field[:, None, part]) @ kernel_x.T
-    return total.real.square(), total.imag.square()
+    return total.real.square() + total.imag.square()
 
 
 # ---- the table -----------------------------------------------------------------------------------------------------

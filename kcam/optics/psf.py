@@ -37,6 +37,7 @@ from kcam.optics.transforms import (
     FFTTransform,
     MatrixTransform,
     Pair,
+    Transform,
     fast_length,
     pupil_intensity,
 )
@@ -174,7 +175,7 @@ def ray_displacement(query: Query) -> Tensor:
         inside = (query.pupil(x, y).rho2 <= 1.0001) | (not query.lens.round)
         step = float(side[1] - side[0]) * float(query.semi_aperture)
         gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
-        slope2 = sum((coefficients.flatten(0, 1) @ g.flatten(1)) ** 2 for g in gradients)
+        slope2 = torch.stack([(coefficients.flatten(0, 1) @ g.flatten(1)) ** 2 for g in gradients]).sum(0)
         slope2 = torch.where(inside.flatten(), slope2, slope2.new_zeros(()))
         slope = slope2.amax(dim=1).sqrt().view(query.wavelengths.numel(), -1).amax(dim=1)
         return (slope * query.sensor_distance).cpu()
@@ -260,7 +261,7 @@ def _grid_group(
     amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing)
     field = None if cells is None else _pixel_field(query, cells, spacing=spacing)
 
-    build: dict[str, Callable[[float], object]] = {
+    build: dict[str, Callable[[float], Transform]] = {
         "matrix": lambda s: MatrixTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
         "chirp_z": lambda s: ChirpZTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
         "fft": lambda s: FFTTransform(count, length, reach),
@@ -376,8 +377,8 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     amplitude = torch.ones(cells, cells, dtype=query.dtype, device=query.device)
     power = amplitude
     if discs:
-        coverage = sum(w * disc_coverage(cells, half_width=half_width, radius=r) for r, w in discs)
-        amplitude = power = coverage.to(amplitude)
+        shares = [w * disc_coverage(cells, half_width=half_width, radius=r) for r, w in discs]
+        amplitude = power = torch.stack(shares).sum(0).to(amplitude)
     phases, factors = [], []
     for pixels, width in zip(maps, widths, strict=True):
         values = look_up(pixels.values, width)
@@ -476,7 +477,9 @@ class _PixelField(torch.autograd.Function):
 
 def _sines(factor: Tensor, phases: Tensor) -> Pair:
     """Cosine and sine of sum_e factor_e * phase_e."""
-    angle = (factor[:, None, None] * phases).sum(0)
+    angle = factor[0] * phases[0]
+    for own, phase in zip(factor[1:], phases[1:], strict=True):
+        angle.addcmul_(own, phase)
     return angle.cos(), angle.sin()
 
 

@@ -159,15 +159,23 @@ def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     coverage = np.diff(np.diff(area, axis=0), axis=1) / (spacing / _FINE / radius) ** 2
     taps = _kaiser_sinc(np.arange(-reach, reach + 1) / _FINE, half_width=_EDGE_HALF_WIDTH, beta=13.2)
     taps = np.convolve(taps, [-1 / 24, 13 / 12, -1 / 24])  # undoes the droop of the cell average
-    taps = torch.as_tensor(taps / taps.sum())
+    kernel = torch.as_tensor(taps / taps.sum())
 
     quadrant = torch.as_tensor(coverage)
     for _ in range(2):  # rows, then (transposed) columns; mirrored about the axis for the taps that reach across it
         mirrored = torch.cat([quadrant[:, : reach + 1].flip(1), quadrant], dim=1)
         start = (_FINE - 1) // 2  # node j sits at the centre of cell 5 j + 2
-        signal = mirrored[:, start : start + (half - 1) * _FINE + taps.numel()]
-        quadrant = torch.nn.functional.conv1d(signal[:, None], taps[None, None], stride=_FINE)[:, 0].T
+        signal = mirrored[:, start : start + (half - 1) * _FINE + kernel.numel()]
+        quadrant = torch.nn.functional.conv1d(signal[:, None], kernel[None, None], stride=_FINE)[:, 0].T
     return quadrant.contiguous()
+
+
+def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing: float) -> Tensor:
+    """`disc_weights` of an aperture made of discs (radius, weight), (count // 2, count // 2)."""
+    quadrant = torch.zeros(count // 2, count // 2, dtype=torch.float64)
+    for radius, weight in discs:
+        quadrant = quadrant + weight * disc_weights(count, spacing=spacing, radius=radius)
+    return quadrant
 
 
 def unfold_quadrant(quadrant: Tensor) -> Tensor:
