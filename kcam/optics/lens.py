@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from kcam.optics.elements import Aperture, Element, PlanoConvexLens, Scalar, float64, set_scalar
+from kcam.optics.elements import DOE, Aperture, Element, PlanoConvexLens, Scalar, float64, set_scalar
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
@@ -76,6 +76,11 @@ class Lens(nn.Module):
         """The element that bounds the pupil."""
         return next(element for element in self.elements if isinstance(element, Aperture))
 
+    def aperture_alone(self, *, pixels: int | None = None) -> Lens:
+        """The same pupil at the same distance from the sensor, with nothing in it, or with a flat DOE of n pixels."""
+        flat = [] if pixels is None else [DOE(torch.zeros(pixels, pixels))]
+        return Lens(self.aperture, *flat, sensor_distance=self.sensor_distance)
+
     @property
     def symmetric(self) -> bool:
         """Whether every element is rotationally symmetric by its type."""
@@ -85,6 +90,12 @@ class Lens(nn.Module):
     def round(self) -> bool:
         """Whether the rim of the aperture is a circle."""
         return bool(self.aperture.discs())
+
+    @property
+    def has_pixels(self) -> bool:
+        """Whether an element is a map of flat pixels, a phase or a transmission."""
+        grid = wavelength_grid([self.focus_wavelength])
+        return any(element.pixel_map(grid) is not None for element in self.elements)
 
     @property
     def has_pixel_phase(self) -> bool:

@@ -9,6 +9,7 @@ of that light which falls into its window, and is not normalised to 1.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -34,21 +35,21 @@ from kcam.optics.pupil import (
 )
 from kcam.optics.transforms import (
     ChirpZTransform,
+    Curvature,
+    CurvedTransform,
     FFTTransform,
     MatrixTransform,
     Pair,
     Transform,
     fast_length,
+    mean_slope,
     pupil_intensity,
 )
 
 if TYPE_CHECKING:
     from kcam.optics.lens import Lens
 
-_BLOCK_PHASE = 0.03  # radians; 0.1 costs 2e-3 of the PSF, 0.02 1e-4
-_MAX_BLOCKS = 128
-_CELLS_PER_SAMPLE = 1.7  # at least, for each pupil sample: the rim cuts cells by their area
-_MOST_CELLS = 2048  # on which several maps are brought together exactly; beyond, by the nearest pixel
+_MOST_CELLS = 3072  # on which several maps are brought together exactly, beyond by the nearest pixel; and the rim
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class Query:
     pixel_pitch [m]; shape: (H, W) pixels; integrate: over pixels (else point samples times the pixel's area).
     active: width of the light-sensitive part of a pixel (square root of the fill factor).
     samples: across the pupil, or None for the rule of `sampling.pupil_samples` with `kappa`.
+    cells_per_sample: of pixel maps, at least, for each pupil sample and axis: the rim cuts cells by their area.
     """
 
     lens: Lens
@@ -73,6 +75,7 @@ class Query:
     active: float = 1.0
     kappa: float = sampling.KAPPA
     samples: int | None = None
+    cells_per_sample: float = 1.7
 
     @property
     def semi_aperture(self) -> Tensor:
@@ -117,6 +120,13 @@ class Query:
                 wavelength=wavelength,
             )
         return per_pixel, math.ceil(per_pixel * self.half_pixels)
+
+    def aperture_pixels(self) -> Tensor:
+        """The transmission of an aperture that is a map of pixels, (n, n)."""
+        pixels = self.lens.aperture.pixel_map(self.wavelengths)
+        if pixels is None:
+            raise TypeError(f"{type(self.lens.aperture).__name__} has neither discs() nor a pixel_map().")
+        return pixels.values
 
     def pupil(self, x: Tensor, y: Tensor) -> Pupil:
         """The pupil at true normalised coordinates."""
@@ -242,44 +252,65 @@ def _grid_group(
 ) -> Tensor:
     wavelengths = query.wavelengths[members].to(query.device)
     wavenumbers = 2 * math.pi / wavelengths
-    scales = wavenumbers * query.image_side_semi_aperture / query.sensor_distance
+    curved = query.lens.has_pixels and not query.paraxial  # flat pixels are sampled in the true pupil plane
+    semi_aperture = query.semi_aperture if curved else query.image_side_semi_aperture
+    slope = mean_slope(float(query.tau.detach())) if curved else 1.0
+    scales = wavenumbers * semi_aperture / query.sensor_distance
     step = query.pixel_pitch / per_pixel
     reach = math.ceil(per_pixel * query.half_pixels)
     like = torch.empty(0, dtype=query.dtype, device=query.device)
 
     spacing, length = grid_spacing(count), 0
     if method == "fft":
-        scale_step = float(scales[0].detach()) * step
+        scale_step = float(scales[0].detach()) * slope * step
         extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]])) / step
         count, length, spacing = _fft_grid(scale_step, shortest=max(math.ceil(extent), 2 * reach + 1))
     nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
 
-    x, y = from_image_side(nodes[None, :].to(query.device), nodes[:, None].to(query.device), query.tau)
-    pupil = query.pupil(x, y)
-    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
     cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
+    x, y = nodes[None, :].to(query.device), nodes[:, None].to(query.device)
+    pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
+    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
     amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing)
-    field = None if cells is None else _pixel_field(query, cells, spacing=spacing)
+    field = None if cells is None else _PixelField.apply(cells.phases, cells.factors, cells.amplitude, cells.weights)
 
-    build: dict[str, Callable[[float], Transform]] = {
-        "matrix": lambda s: MatrixTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
-        "chirp_z": lambda s: ChirpZTransform.build(nodes, scale=s, step=step, reach=reach, like=like),
-        "fft": lambda s: FFTTransform(count, length, reach),
-    }
+    def straight(scale: float) -> Transform:
+        if method == "fft":
+            return FFTTransform(count, length, reach)
+        build = MatrixTransform.build if method == "matrix" else ChirpZTransform.build
+        return build(nodes, scale=scale * slope, step=step, reach=reach, like=like)
+
+    kernels = [straight(float(scale)) for scale in scales.detach()]
+    if curved:
+        kernels = _curve(query, kernels, scales, nodes, step=step, reach=reach, like=like)
     intensity = pupil_intensity(
         (wavenumbers[:, None, None] * coefficients).to(query.dtype),
         maps=maps.to(query.dtype),
         amplitude=amplitude.to(query.dtype),
         field=field,
         scales=scales.to(query.dtype),
-        transforms=[build[method](float(s)) for s in scales.detach()],
+        transforms=kernels,
         nodes=nodes,
         step=step,
+        tau=query.tau if curved else None,
     )
-    # |sum w P|^2 -> energy per pixel: (a'^2 h^2)^2 p^2 / (lambda d)^2 / E
-    area = query.image_side_semi_aperture**2 * spacing**2
+    # |sum w P|^2 -> energy per pixel: (a^2 h^2)^2 p^2 / (lambda d)^2 / E
+    area = semi_aperture**2 * spacing**2
     factor = area * query.pixel_pitch**2 / (wavelengths * query.sensor_distance)[:, None] ** 2 / energy
     return to_pixels(intensity, query, per_pixel=per_pixel, reach=reach) * factor[..., None, None].to(query.dtype)
+
+
+def _curve(
+    query: Query, kernels: list[Transform], scales: Tensor, nodes: Tensor, *, step: float, reach: int, like: Tensor
+) -> list[Transform]:
+    """The kernels of a group, curved as far as each needs it."""
+    tau = float(query.tau.detach())
+    strengths = [float(scale) * max(reach, 1) * step for scale in scales.detach()]
+    # at the corner of window and pupil; a PSF sees a hundredth of it, a gradient to the geometry has one power less
+    error = 1e-8 if query.dtype == torch.float64 else 1e-4
+    orders = [Curvature.order_for(strength, tau=tau, error=error) for strength in strengths]
+    shared = Curvature.build(kernels[0], nodes, tau=tau, step=step, reach=reach, order=max(orders), like=like)
+    return [CurvedTransform(*parts) for parts in zip(kernels, itertools.repeat(shared), strengths, orders)]
 
 
 def _fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:
@@ -313,16 +344,16 @@ def _amplitude(
             weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
         transmission = power = unfold_quadrant(weights).to(query.device)
     else:
-        power = _following(query.tau, lambda tau: map_onto(cells.power, cells.weights(tau)), spacing=spacing)
-        power = power.to(torch.float64)
+        power = map_onto(cells.power, cells.weights).to(torch.float64)
         transmission = torch.ones_like(power)
     amplitude, energy = transmission[None], power[None]
     if not query.paraxial:
         # a spherical wave's amplitude falls as 1 / R over the pupil: 1 / sqrt(1 + V^2 r^2)
         r2 = pupil.rho2 * query.semi_aperture**2
         falloff = 1 / (1 + query.vergences[:, None, None] ** 2 * r2)
-        amplitude = amplitude * pupil.measure * torch.sqrt(falloff)
-        energy = energy * pupil.measure**2 * falloff
+        # the Debye map's amplitude is `measure` in the image-side plane; d^2 u' / d^2 u is measure^-2
+        amplitude = amplitude * (pupil.measure if cells is None else 1 / pupil.measure) * torch.sqrt(falloff)
+        energy = energy * (pupil.measure**2 if cells is None else 1) * falloff
     return amplitude, energy.sum((-2, -1))
 
 
@@ -332,14 +363,14 @@ class _Cells:
 
     amplitude, power: (C, C) what the aperture transmits, the rim by the exact area of each cell.
     phases: (E, C, C) of the phase maps [rad], their `factors` (E, L).
-    weights: from the cells to the pupil grid, for a tau = (a / d)^2.
+    weights: from the cells to the pupil grid.
     """
 
     amplitude: Tensor
     power: Tensor
     phases: Tensor
     factors: Tensor
-    weights: Callable[[float], MapWeights]
+    weights: MapWeights
 
 
 def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: float) -> _Cells | None:
@@ -363,7 +394,10 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     base, half_width = sizes[finest], widths[finest]
     common = math.lcm(*(size for size, width in zip(sizes, widths, strict=True) if width == half_width))
     base = common if common <= _MOST_CELLS else base
-    refine = math.ceil(_CELLS_PER_SAMPLE * count * half_width / base) if discs or len(maps) > 1 else 1
+    refine = 1
+    if discs or len(maps) > 1:
+        most = max(_MOST_CELLS, 2 * count) / base
+        refine = max(1, math.ceil(min(query.cells_per_sample * count * half_width / base, most)))
     missing = max(0, math.ceil((1 - half_width) * base / (2 * half_width) - 1e-9))
     cells = (base + 2 * missing) * refine
     half_width *= (base + 2 * missing) / base
@@ -393,29 +427,10 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
         inside = square_coverage(cells, half_width=half_width).to(amplitude)
         amplitude, power = amplitude * inside, power * inside
 
-    def weights(tau: float) -> MapWeights:
-        return _map_weights_at(query, tau, cells, half_width, count=count, spacing=spacing)
-
+    weights = map_weights(
+        cells, half_width=half_width, count=count, spacing=spacing, dtype=query.dtype, device=query.device
+    )
     return _Cells(amplitude, power, torch.stack(phases), torch.stack(factors).to(query.dtype), weights)
-
-
-def _map_weights_at(
-    query: Query, tau: float, cells: int, half_width: float, *, count: int, spacing: float
-) -> MapWeights:
-    # inside a block a pixel's edge moves by up to k w a tau / 2d / blocks of phase at the corner of pupil and window
-    wavenumber = 2 * math.pi / float(query.wavelengths.min())
-    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
-    own = 0.0 if query.paraxial else (a / d) ** 2
-    blocks = max(1, math.ceil(wavenumber * query.half_window * a * own / (2 * d) / _BLOCK_PHASE))
-    return map_weights(
-        cells,
-        half_width=half_width,
-        count=count,
-        tau=tau,
-        blocks=min(_MAX_BLOCKS, blocks),
-        spacing=spacing,
-        dtype=query.dtype,
-    ).to(query.device)
 
 
 def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: float) -> Tensor:
@@ -431,16 +446,6 @@ def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: flo
     with torch.no_grad():
         slope = (evaluate(float(tau) + step) - evaluate(float(tau) - step)) / (2 * step)
     return value + ((tau - tau.detach()) * slope).to(value)
-
-
-def _pixel_field(query: Query, cells: _Cells, *, spacing: float) -> Pair:
-    """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (L, N, N)."""
-
-    def both(tau: float) -> Tensor:
-        return torch.stack(_PixelField.apply(cells.phases, cells.factors, cells.amplitude, cells.weights(tau)))
-
-    re, im = _following(query.tau, both, spacing=spacing)
-    return re, im
 
 
 class _PixelField(torch.autograd.Function):

@@ -1,19 +1,19 @@
 """The pupil plane: where it is sampled, and with which quadrature weights.
 
-Coordinates are normalised by the semi-aperture a. A propagation samples the *image-side* coordinate
+Coordinates are normalised by the semi-aperture a. A smooth pupil is sampled in the *image-side* coordinate
 
     xi' = u' / a',   u' = u / sqrt(1 + r^2 / d^2),   a' = a / sqrt(1 + tau),   tau = (a / d)^2,
 
 which is proportional to the direction cosine towards the sensor, so that the Fourier kernel exp(-i k x u' / d) holds
-beyond the paraxial range (the Debye map). tau = 0 gives the paraxial (Fresnel) plane, where u' = u.
+beyond the paraxial range (the Debye map). tau = 0 gives the paraxial (Fresnel) plane, where u' = u. Flat pixels, whose
+edges would be curved there, are sampled in the true plane; `transforms.CurvedTransform` then curves the kernel instead.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -93,12 +93,6 @@ def from_image_side(x: Tensor, y: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
     Nodes beyond the rim (where the edge weights die away) are held at a positive denominator.
     """
     scale = torch.rsqrt(torch.clamp(1 + tau * (1 - x**2 - y**2), min=1e-3))
-    return x * scale, y * scale
-
-
-def to_image_side(x: Tensor, y: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
-    """Image-side coordinates of true pupil coordinates, the inverse of `from_image_side`."""
-    scale = torch.sqrt((1 + tau) / (1 + tau * (x**2 + y**2)))
     return x * scale, y * scale
 
 
@@ -208,10 +202,10 @@ def pixel_weights(edges: Tensor, nodes: Tensor, *, spacing: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _BandedMatrices:
-    """Matrices (n, N), one for each block of rows, cut into slabs of columns with only the band of rows that they need.
+class MapWeights:
+    """Linear map from an n x n pixel map onto an N x N pupil grid, separable: one matrix (n, N) for both axes.
 
-    slabs: (blocks, width, columns of the slab) each; starts: first row of each band.
+    slabs: the matrix cut into slabs of columns, each with only the band of rows that it needs; starts: of the bands.
     """
 
     slabs: tuple[Tensor, ...]
@@ -220,75 +214,44 @@ class _BandedMatrices:
     outputs: int
 
     @staticmethod
-    def build(matrices: list[Tensor], *, dtype: torch.dtype) -> _BandedMatrices:
-        """Cut the bands out of dense matrices, (n, N) each."""
-        inputs, outputs = matrices[0].shape
-        used = torch.stack([matrix != 0 for matrix in matrices]).any(0)
+    def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> MapWeights:
+        """Cut the bands out of a dense matrix (n, N)."""
+        inputs, outputs = matrix.shape
         slabs, starts = [], []
         for first in range(0, outputs, _SLAB_COLUMNS):
-            columns = slice(first, first + _SLAB_COLUMNS)
-            rows = used[:, columns].any(1).nonzero().flatten()
+            columns = matrix[:, first : first + _SLAB_COLUMNS]
+            rows = (columns != 0).any(1).nonzero().flatten()
             low, high = (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 1)
-            slabs.append(torch.stack([matrix[low:high, columns].to(dtype) for matrix in matrices]))
+            slabs.append(columns[low:high].to(device, dtype))
             starts.append(low)
-        return _BandedMatrices(tuple(slabs), tuple(starts), inputs, outputs)
+        return MapWeights(tuple(slabs), tuple(starts), inputs, outputs)
 
-    def pieces(self, lines: int) -> Iterator[tuple[Tensor, slice, slice, slice]]:
-        """(matrix, its inputs, its outputs, the lines that it acts on), the lines in equal blocks."""
-        blocks = self.slabs[0].shape[0]
-        length = math.ceil(lines / blocks)
+    def _pieces(self) -> Iterator[tuple[Tensor, slice, slice]]:
+        """(matrix, its inputs, its outputs)."""
         at = 0
         for slab, start in zip(self.slabs, self.starts, strict=True):
-            for block in range(math.ceil(lines / length)):
-                matrix = slab[block]
-                yield (
-                    matrix,
-                    slice(start, start + matrix.shape[0]),
-                    slice(at, at + matrix.shape[1]),
-                    slice(block * length, min((block + 1) * length, lines)),
-                )
-            at += slab.shape[2]
-
-
-@dataclass(frozen=True)
-class MapWeights:
-    """Linear map from an n x n pixel map onto an N x N pupil grid: along the map's rows, then along the grid's columns.
-
-    In the paraxial plane one matrix each is exact. In the Debye plane the pixels' edges are curved, so the rows are
-    taken in blocks thin enough that a pixel moves by less than a stated phase inside a block.
-    """
-
-    along_x: _BandedMatrices
-    along_y: _BandedMatrices
+            yield slab, slice(start, start + slab.shape[0]), slice(at, at + slab.shape[1])
+            at += slab.shape[1]
 
     def forward(self, field: Tensor) -> Tensor:
         """(n, n) -> (N, N)."""
-        half = field.new_empty(field.shape[0], self.along_x.outputs)
-        for matrix, source, target, rows in self.along_x.pieces(field.shape[0]):
-            torch.mm(field[rows, source], matrix, out=half[rows, target])
-        grid = field.new_empty(self.along_y.outputs, half.shape[1])
-        for matrix, source, target, columns in self.along_y.pieces(half.shape[1]):
-            torch.mm(matrix.T, half[source, columns], out=grid[target, columns])
+        half = field.new_empty(field.shape[0], self.outputs)
+        for matrix, source, target in self._pieces():
+            torch.mm(field[:, source], matrix, out=half[:, target])
+        grid = field.new_empty(self.outputs, self.outputs)
+        for matrix, source, target in self._pieces():
+            torch.mm(matrix.T, half[source], out=grid[target])
         return grid
 
     def adjoint(self, grid: Tensor) -> Tensor:
         """(N, N) -> (n, n), the transpose of `forward`."""
-        half = grid.new_zeros(self.along_y.inputs, grid.shape[1])
-        for matrix, source, target, columns in self.along_y.pieces(grid.shape[1]):
-            half[source, columns].addmm_(matrix, grid[target, columns])
-        field = grid.new_zeros(half.shape[0], self.along_x.inputs)
-        for matrix, source, target, rows in self.along_x.pieces(half.shape[0]):
-            field[rows, source].addmm_(half[rows, target], matrix.T)
+        half = grid.new_zeros(self.inputs, self.outputs)
+        for matrix, source, target in self._pieces():
+            half[source].addmm_(matrix, grid[target])
+        field = grid.new_zeros(self.inputs, self.inputs)
+        for matrix, source, target in self._pieces():
+            field[:, source].addmm_(half[:, target], matrix.T)
         return field
-
-    def to(self, device: torch.device) -> MapWeights:
-        """The same map on another device."""
-        return MapWeights(
-            *(
-                replace(part, slabs=tuple(slab.to(device) for slab in part.slabs))
-                for part in (self.along_x, self.along_y)
-            )
-        )
 
 
 class _MapOnto(torch.autograd.Function):
@@ -309,61 +272,27 @@ def map_onto(field: Tensor, weights: MapWeights) -> Tensor:
     return _MapOnto.apply(field, weights)
 
 
-def _block_centres(positions: Tensor, blocks: int) -> Tensor:
-    """Centre of each block of equally spaced positions (blocks as `_blocked` makes them)."""
-    length = math.ceil(positions.numel() / blocks)
-    step = positions[1] - positions[0] if positions.numel() > 1 else positions.new_zeros(())
-    return positions[0] + step * ((torch.arange(blocks, dtype=torch.float64) + 0.5) * length - 0.5)
-
-
+@functools.lru_cache(maxsize=6)
 def map_weights(
-    pixels: int,
-    *,
-    half_width: float,
-    count: int,
-    tau: float,
-    blocks: int,
-    spacing: float,
-    dtype: torch.dtype,
+    pixels: int, *, half_width: float, count: int, spacing: float, dtype: torch.dtype, device: torch.device
 ) -> MapWeights:
-    """Weights that bring a map of flat square pixels onto the image-side pupil grid, through a low-pass at its Nyquist.
+    """Weights that bring a map of flat square pixels onto the true pupil plane, through a low-pass at its Nyquist.
 
     Args:
         pixels: n, the map is n x n.
         half_width: of the map in units of the semi-aperture (1: it spans the bounding square).
         count, spacing: of the pupil grid.
-        tau: (a / d)^2, 0 for the paraxial plane.
-        blocks: into how many blocks rows (and columns) are grouped; 1 when tau is 0.
         dtype: of the weights, which are built in float64.
     Valid when the grid has at least 2.5 samples per cycle of what reaches the window (the default sampling).
     """
-    return _map_weights(pixels, half_width, count, tau, min(blocks, pixels, count), spacing, dtype)
-
-
-@functools.lru_cache(maxsize=6)
-def _map_weights(
-    pixels: int,
-    half_width: float,
-    count: int,
-    tau: float,
-    blocks: int,
-    spacing: float,
-    dtype: torch.dtype,
-) -> MapWeights:
     edges = torch.linspace(-half_width, half_width, pixels + 1, dtype=torch.float64)
-    centres = (edges[1:] + edges[:-1]) / 2
     nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
-    tau_ = torch.tensor(tau, dtype=torch.float64)
+    return MapWeights.build(pixel_weights(edges, nodes, spacing=spacing).T, dtype=dtype, device=device)
 
-    rows = _block_centres(centres, blocks)[:, None]
-    along_x = to_image_side(edges[None], rows, tau_)[0]
-    # A column of nodes crosses the map at a true u that varies with v: u^2 = U^2 (1 + tau v^2) / (1 - tau U^2)
-    column = _block_centres(nodes, blocks)[:, None] / math.sqrt(1 + tau)
-    true_x2 = column**2 * (1 + tau * edges**2) / torch.clamp(1 - tau * column**2, min=1e-3)
-    along_y = to_image_side(torch.sqrt(true_x2), edges[None].expand_as(true_x2), tau_)[1]
-    return MapWeights(
-        *(
-            _BandedMatrices.build([pixel_weights(e, nodes, spacing=spacing).T for e in edges], dtype=dtype)
-            for edges in (along_x, along_y)
-        )
-    )
+
+def pixel_under(values: Tensor, half_width: float | Tensor | None, axis: Tensor, semi_aperture: Tensor) -> Tensor:
+    """Value of the flat pixel under each point of a square grid with this axis [m]; the outermost pixels continue."""
+    n = values.shape[-1]
+    width = semi_aperture if half_width is None else half_width
+    cell = torch.clamp(((axis / width + 1) / 2 * n).detach().floor().long(), 0, n - 1)
+    return values[cell][:, cell]

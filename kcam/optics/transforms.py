@@ -1,15 +1,17 @@
 """From the pupil to the sensor: the Fourier transforms that hit the pixel grid, and their adjoints.
 
 All compute U(x, y) = sum_jk P(xi_j, eta_k) exp(-i s (x xi_j + y eta_k)) for points x = m * step, m = -K..K, and differ
-in cost alone. Each is used through `pupil_intensity`, which forms P from its phase, keeps only U for the backward pass
-and computes sines and cosines again there (a bank of PSFs would otherwise hold every pupil in memory).
+in cost alone; `CurvedTransform` bends the kernel of any of them. Each is used through `pupil_intensity`, which forms P
+from its phase, keeps only U for the backward pass and computes sines and cosines again there (a bank of PSFs would
+otherwise hold every pupil in memory).
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -65,6 +67,9 @@ class Transform(Protocol):
 
     def scatter(self, image: Tensor) -> Tensor:
         """Transpose of `assemble`."""
+
+    def arrange_points(self, image: Tensor) -> Tensor:
+        """An image (2K+1, 2K+1) of values at the points, in the layout of the field."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +167,12 @@ class MatrixTransform:
         return torch.stack([down[..., k:], left[0], up[..., k:], left[1]], dim=-3)
 
 
+    def arrange_points(self, image: Tensor) -> Tensor:
+        k = self.cosine_sine.shape[-1] - 1
+        up, down = image[: k + 1].flip(0), image[k:]
+        return torch.stack([down[:, k:], down[:, : k + 1].flip(1), up[:, k:], up[:, : k + 1].flip(1)])
+
+
 @dataclass(frozen=True)
 class _PlainLayout:
     """Layout of the transforms that work on the whole grid."""
@@ -169,7 +180,7 @@ class _PlainLayout:
     def arrange(self, maps: Tensor) -> Tensor:
         return maps
 
-    disarrange = assemble = scatter = arrange
+    disarrange = assemble = scatter = arrange_points = arrange
 
 
 @dataclass(frozen=True)
@@ -255,11 +266,117 @@ class FFTTransform(_PlainLayout):
         return phase[:, None] * phase[None, :]
 
 
+def mean_slope(tau: float) -> float:
+    """What of 1 / q = 1 / sqrt(1 + tau rho^2) is split off as its mean: leaves the least max |rho delta| over the disc.
+
+    Near tau / 8 for small tau, where 1 / q - 1 itself reaches tau / 2.
+    """
+    return 1 - 0.75 * (1 - 1 / math.sqrt(1 + tau))
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """The terms of a curved kernel that all wavelengths on one grid share.
+
+    terms: (p, r, (xi delta)^p (eta delta)^r over the pupil, (x / extent)^p (y / extent)^r over the points), by p + r,
+    in the layout of the transform that they go with. extent: from the origin to the edge of the points [m].
+    """
+
+    terms: tuple[tuple[int, int, Tensor, Tensor], ...]
+    extent: float
+
+    @staticmethod
+    def order_for(strength: float, *, tau: float, error: float) -> int:
+        """The highest power p + r that leaves `error` at the corner of window and pupil; strength: scale * extent."""
+        rho = torch.linspace(0, 1, 33, dtype=torch.float64)
+        delta = torch.rsqrt(1 + tau * rho**2) - mean_slope(tau)
+        phase = math.sqrt(2) * strength * float((rho * delta).abs().max())
+        order, remainder = 0, phase
+        while remainder > error:
+            order += 1
+            remainder *= phase / (order + 1)
+        return order
+
+    @staticmethod
+    def build(layout: Transform, nodes: Tensor, *, tau: float, step: float, reach: int, order: int, like: Tensor):
+        """Terms up to `order` on pupil nodes (N,) and points m * step, |m| <= reach."""
+        extent = max(reach, 1) * step
+        delta = torch.rsqrt(1 + tau * (nodes[:, None] ** 2 + nodes**2)) - mean_slope(tau)
+        along_x, along_y = nodes[None, :] * delta, nodes[:, None] * delta
+        points = torch.arange(-reach, reach + 1, dtype=torch.float64) * (step / extent)
+        terms = []
+        for p, r in ((p, total - p) for total in range(order + 1) for p in range(total + 1)):
+            over_pupil = layout.arrange((along_x**p * along_y**r).to(like))
+            over_points = layout.arrange_points((points[None, :] ** p * points[:, None] ** r).to(like))
+            terms.append((p, r, over_pupil, over_points))
+        return Curvature(tuple(terms), extent)
+
+
+@dataclass(frozen=True)
+class CurvedTransform:
+    """The kernel beyond the paraxial range, exp(-i s (x xi + y eta) / q), q = sqrt(1 + tau rho^2), in the true plane.
+
+    The inner transform has the mean of 1 / q; the rest, delta, is a phase of a radian or so, and its exponential a
+    short series, each term of which is separable:
+
+        sum_pr (-i s x)^p (-i s y)^r / (p! r!) T[(xi delta)^p (eta delta)^r P],  p + r <= order.
+
+    inner: built with scale * mean_slope(tau). strength: scale * extent.
+    """
+
+    inner: Transform
+    curvature: Curvature
+    strength: float
+    order: int
+
+    def _terms(self) -> Iterator[tuple[int, float, Tensor, Tensor]]:
+        for p, r, over_pupil, over_points in self.curvature.terms:
+            if p + r <= self.order:
+                weight = self.strength ** (p + r) / (math.factorial(p) * math.factorial(r))
+                yield p + r, weight, over_pupil, over_points
+
+    def forward(self, pupil: Pair) -> Pair:
+        total = self.inner.forward(pupil)
+        for power, weight, over_pupil, over_points in itertools.islice(self._terms(), 1, None):
+            part = self.inner.forward((pupil[0] * over_pupil, pupil[1] * over_pupil))
+            for sums, values in zip(total, _times_power_of_i(part, -power), strict=True):
+                sums.addcmul_(values, over_points, value=weight)
+        return total
+
+    def adjoint(self, field: Pair) -> Pair:
+        total = self.inner.adjoint(field)
+        for power, weight, over_pupil, over_points in itertools.islice(self._terms(), 1, None):
+            part = self.inner.adjoint((field[0] * over_points, field[1] * over_points))
+            for sums, values in zip(total, _times_power_of_i(part, power), strict=True):
+                sums.addcmul_(values, over_pupil, value=weight)
+        return total
+
+    def arrange(self, maps: Tensor) -> Tensor:
+        return self.inner.arrange(maps)
+
+    def disarrange(self, maps: Tensor) -> Tensor:
+        return self.inner.disarrange(maps)
+
+    def assemble(self, intensity: Tensor) -> Tensor:
+        return self.inner.assemble(intensity)
+
+    def scatter(self, image: Tensor) -> Tensor:
+        return self.inner.scatter(image)
+
+    def arrange_points(self, image: Tensor) -> Tensor:
+        return self.inner.arrange_points(image)
+
+
+def _times_power_of_i(values: Pair, power: int) -> Pair:
+    re, im = values
+    return ((re, im), (-im, re), (-re, -im), (im, -re))[power % 4]
+
+
 class _PupilIntensity(torch.autograd.Function):
     """|transform(amplitude * field * exp(i coefficients @ maps))|^2 for each group, nothing kept but U."""
 
     @staticmethod
-    def forward(ctx, coefficients, maps, amplitude, field_re, field_im, scales, transforms, nodes, step):
+    def forward(ctx, coefficients, maps, amplitude, field_re, field_im, scales, tau, transforms, nodes, step):
         first = transforms[0]
         laid = first.arrange(maps), first.arrange(amplitude)
         fields = None if field_re is None else (first.arrange(field_re), first.arrange(field_im))
@@ -272,24 +389,26 @@ class _PupilIntensity(torch.autograd.Function):
         ctx.transforms, ctx.nodes, ctx.step = transforms, nodes, step
         ctx.has_field = field_re is not None
         fields_kept = (field_re, field_im) if ctx.has_field else ()
-        ctx.save_for_backward(coefficients, maps, amplitude, *fields_kept, *kept)
+        ctx.save_for_backward(coefficients, maps, amplitude, scales, tau, *fields_kept, *kept)
         return torch.stack(images)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        coefficients, maps, amplitude, *rest = ctx.saved_tensors
+        coefficients, maps, amplitude, scales, tau, *rest = ctx.saved_tensors
         first = ctx.transforms[0]
         laid = first.arrange(maps), first.arrange(amplitude)
         fields = None
         if ctx.has_field:
             fields, rest = (first.arrange(rest[0]), first.arrange(rest[1])), rest[2:]
-        need_coefficients, need_maps, need_amplitude, need_field, _, need_scale = ctx.needs_input_grad[:6]
+        need_coefficients, need_maps, need_amplitude, need_field, _, need_scale, need_tau = ctx.needs_input_grad[:7]
         d_coefficients = torch.empty_like(coefficients)
         d_maps = torch.zeros_like(laid[0]) if need_maps else None
         d_amplitude = torch.zeros_like(laid[1]) if need_amplitude else None
         d_field = ([], [])
         d_scale = []
+        d_tau = torch.zeros_like(tau)
+        q2 = 1 + tau * (ctx.nodes[:, None] ** 2 + ctx.nodes**2).to(tau)
         with full_precision(grad.device):
             for group, transform in enumerate(ctx.transforms):
                 re, im = rest[2 * group], rest[2 * group + 1]
@@ -314,8 +433,12 @@ class _PupilIntensity(torch.autograd.Function):
                         if fields is not None:
                             onto = turned[0] * fields[0][group] + turned[1] * fields[1][group]
                         d_amplitude += onto if d_amplitude.shape[0] == onto.shape[0] else onto.sum(0, keepdim=True)
-                if need_scale:
-                    d_scale.append(_scale_gradient(transform, pupil, (weight * re, weight * im), ctx.nodes, ctx.step))
+                d_u = (weight * re, weight * im)
+                if need_scale:  # the kernel's exponent is -i s (x xi + y eta) / q
+                    d_scale.append(_kernel_gradient(transform, pupil, d_u, ctx.nodes, ctx.step, q2.rsqrt()))
+                if need_tau:  # d(1 / q) / d tau = (1 - q^2) / (2 tau q^3)
+                    slope = -(ctx.nodes[:, None] ** 2 + ctx.nodes**2).to(tau) / (2 * q2**1.5)
+                    d_tau += scales[group] * _kernel_gradient(transform, pupil, d_u, ctx.nodes, ctx.step, slope)
         return (
             d_coefficients if need_coefficients else None,
             first.disarrange(d_maps) if need_maps else None,
@@ -323,6 +446,7 @@ class _PupilIntensity(torch.autograd.Function):
             first.disarrange(torch.stack(d_field[0])) if need_field else None,
             first.disarrange(torch.stack(d_field[1])) if need_field else None,
             torch.stack(d_scale) if need_scale else None,
+            d_tau if need_tau else None,
             None,
             None,
             None,
@@ -343,14 +467,14 @@ def _pupil(coefficients: Tensor, laid: tuple[Tensor, Tensor | None], fields: Pai
     return re * f_re - im * f_im, re * f_im + im * f_re
 
 
-def _scale_gradient(transform: Transform, pupil: Pair, d_field: Pair, nodes: Tensor, step: float) -> Tensor:
-    """d(loss)/ds: s only stretches the points, dU/ds = -i (x T[xi P] + y T[eta P])."""
+def _kernel_gradient(
+    transform: Transform, pupil: Pair, d_field: Pair, nodes: Tensor, step: float, slope: Tensor
+) -> Tensor:
+    """d(loss) for d(kernel's exponent) = -i (x xi + y eta) slope: dU = -i (x T[xi slope P] + y T[eta slope P])."""
     total = pupil[0].new_zeros(())
     grid = nodes.to(pupil[0])
-    count = nodes.numel()
     for axis in range(2):
-        ramp = (grid[None, :] if axis == 0 else grid[:, None]).expand(count, count)
-        ramp = transform.arrange(ramp)
+        ramp = transform.arrange((grid[None, :] if axis == 0 else grid[:, None]) * slope.to(grid))
         re, im = transform.forward((pupil[0] * ramp, pupil[1] * ramp))
         product = transform.assemble(d_field[0] * im - d_field[1] * re)  # Re(conj(dU) (-i) T)
         points = (torch.arange(product.shape[-1], device=grid.device) - product.shape[-1] // 2).to(grid) * step
@@ -365,9 +489,10 @@ def pupil_intensity(
     amplitude: Tensor,
     field: Pair | None,
     scales: Tensor,
-    transforms: list[Transform],
+    transforms: Sequence[Transform],
     nodes: Tensor,
     step: float,
+    tau: Tensor | None = None,
 ) -> Tensor:
     """Intensity of the transformed pupils amplitude * field * exp(i coefficients @ maps).
 
@@ -377,9 +502,13 @@ def pupil_intensity(
         field: real and imaginary part (G, N, N) of what does not fit into a phase (a low-passed pixel map), or None.
         scales: (G,) kernel scales s [1/m], for their gradient. transforms: one for each group, built with that scale.
         nodes: (N,) normalised nodes; step: distance of the points [m].
+        tau: 0-d, the curvature that `CurvedTransform`s were built with, for its gradient; None: straight kernels.
     Returns:
         (G, Z, 2K+1, 2K+1); differentiable once in all tensors.
     """
     re, im = field if field is not None else (None, None)
     with full_precision(coefficients.device):
-        return _PupilIntensity.apply(coefficients, maps, amplitude, re, im, scales, transforms, nodes, step)
+        curvature = torch.zeros_like(scales[0]) if tau is None else tau.to(scales)
+        return _PupilIntensity.apply(
+            coefficients, maps, amplitude, re, im, scales, curvature, transforms, nodes, step
+        )

@@ -1,0 +1,101 @@
+"""A second opinion: the field behind the lens, propagated by its band-limited angular spectrum."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from kcam.optics.psf import Query, ray_displacement, residual_path, to_pixels
+from kcam.optics.pupil import Pupil, pixel_under, round_weights, unfold_quadrant
+from kcam.optics.transforms import fast_length
+
+
+def angular_spectrum_psf(query: Query) -> Tensor:
+    """PSFs by the band-limited angular spectrum of the field behind the lens, which must sample the converging wave.
+
+    H = exp(i k d (sqrt(1 - lambda^2 f^2) - 1)), zero where the sampled H would alias. The spectrum is summed straight
+    onto the evaluation points, so that the grid behind the lens need not fit the pixels.
+    Source: Goodman, Introduction to Fourier Optics, angular spectrum; Matsushima and Shimobaba, Opt. Express 17, 19662
+        (2009).
+    """
+    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
+    displacement = ray_displacement(query)
+    bands = []
+    for index, wavelength in enumerate(query.wavelengths.tolist()):
+        spread = float(displacement[index])
+        # from the rim light goes to the far edge of the window, and a little further: its cycles per metre in the grid
+        across = a + max(query.half_window, spread) + 10 * wavelength * d / (2 * a)
+        steepest = across / math.hypot(across, d) / wavelength
+        pitch = 1 / (2.2 * steepest)
+        # beyond the rays the rim diffracts light into tails, which must not wrap around into the window
+        tails = 50 * wavelength * d / (2 * a)
+        count = fast_length(math.ceil(1.25 * (2 * a + 2 * max(query.half_window, spread) + 2 * tails) / pitch))
+        count += count % 2
+        if count > 8192:
+            raise ValueError(
+                f"angular_spectrum needs a grid of {count} at {wavelength * 1e9:.4g} nm to sample the wave that "
+                f"converges from {2 * a * 1e3:g} mm; use propagator='nonparaxial', which samples the residual only."
+            )
+        bands.append(_spectrum_band(query, index, count=count, pitch=pitch))
+    return torch.stack(bands, dim=1)
+
+
+def _spectrum_band(query: Query, index: int, *, count: int, pitch: float) -> Tensor:
+    wavelength = query.wavelengths[index].to(query.device)
+    wavenumber = 2 * math.pi / wavelength
+    a, d = query.semi_aperture, query.sensor_distance
+    axis = (torch.arange(count, dtype=torch.float64, device=query.device) - count // 2 + 0.5) * pitch
+    pupil = query.pupil(axis[None, :] / a, axis[:, None] / a)
+    one = replace(query, wavelengths=query.wavelengths[index : index + 1])
+    coefficients, maps = residual_path(one, pupil)
+    r2 = pupil.rho2 * a**2
+    converging = r2 / (d * (1 + torch.sqrt(1 + r2 / d**2)))  # sqrt(d^2 + r^2) - d without cancellation
+    phase = wavenumber * (torch.einsum("zt,tvu->zvu", coefficients[0], maps) - converging)
+
+    transmission, power = _point_transmission(query, pupil, pitch=pitch, count=count)
+    falloff = 1 / (1 + query.vergences[:, None, None] ** 2 * r2)
+    field = torch.complex(phase.cos(), phase.sin()) * (transmission * torch.sqrt(falloff))
+    for element in query.lens.elements:
+        pixels = element.pixel_map(one.wavelengths.to(query.device))
+        if pixels is not None and pixels.factors is not None:
+            angle = pixels.factors * pixel_under(pixels.values.to(a), pixels.half_width, axis, a)
+            field = field * torch.complex(angle.cos(), angle.sin())
+    energy = (power * falloff).sum((-2, -1)) * pitch**2
+
+    frequency = torch.fft.fftfreq(count, pitch, dtype=torch.float64, device=query.device)
+    sine2 = wavelength**2 * (frequency[:, None] ** 2 + frequency**2)
+    travel = -wavenumber * d * sine2 / (1 + torch.sqrt(torch.clamp(1 - sine2, min=0)))
+    limit = 1 / (wavelength * torch.sqrt((2 * d.detach() / (count * pitch)) ** 2 + 1))
+    inside = (frequency.abs() <= limit)[:, None] & (frequency.abs() <= limit) & (sine2 < 1)
+    transfer = torch.complex(travel.cos(), travel.sin()) * inside
+
+    complex_dtype = torch.complex128 if query.dtype == torch.float64 else torch.complex64
+    spectrum = torch.fft.fft2(field.to(complex_dtype)) * transfer.to(complex_dtype)
+    per_pixel, reach = query.evaluation_grid(float(wavelength))
+    points = torch.arange(-reach, reach + 1, dtype=torch.float64, device=query.device) * query.pixel_pitch / per_pixel
+    angle = 2 * math.pi * frequency * (points[:, None] - axis[0])
+    kernel = torch.complex(angle.cos(), angle.sin()).to(complex_dtype) / count
+    sensor = kernel @ spectrum @ kernel.T
+    intensity = sensor.real.square() + sensor.imag.square()
+    factor = query.pixel_pitch**2 / energy
+    return to_pixels(intensity, query, per_pixel=per_pixel, reach=reach) * factor[:, None, None].to(query.dtype)
+
+
+def _point_transmission(query: Query, pupil: Pupil, *, pitch: float, count: int) -> tuple[Tensor, Tensor]:
+    """Amplitude and power that the aperture passes on the true pupil plane: edge weights of discs, a look-up in
+    maps.
+    """
+    aperture, a = query.lens.aperture, float(query.semi_aperture.detach())
+    if not aperture.discs():
+        mask = query.aperture_pixels().to(pupil.rho2)
+        inside = (pupil.x.abs() <= 1) & (pupil.y.abs() <= 1)
+        values = pixel_under(mask, None, pupil.x[0] * a, query.semi_aperture) * inside
+        return values, values**2
+    half = min(count // 2, math.ceil(a / pitch) + 8)
+    quadrant = round_weights(aperture.discs(), 2 * half, spacing=pitch / a)
+    margin = count // 2 - half
+    weights = nn.functional.pad(unfold_quadrant(quadrant).to(query.device), (margin, margin, margin, margin))
+    return weights, weights
