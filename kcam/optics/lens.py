@@ -13,14 +13,15 @@ from kcam.optics.elements import Aperture, Element, Scalar, float64, set_scalar
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
+from kcam.precision import full_precision
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 TESTED_F_NUMBERS = (1.8, 100.0)
 """Within these the non-paraxial PSF is held to Rayleigh-Sommerfeld, on the axis and within 1e-2.
 
-At f/1.8 and f/100 for focal lengths of 4.3 mm, ideal or plano-convex, from 0.5 m to infinity (tests/stability); from f/5
-for 50 mm (tests/optics/test_physics.py). Faster, aberrations send light where the Debye map does not hold: 0.5 for a
-plano-convex lens at f/1.4. Slower, pinholes spread it to angles at which the sensor's obliquity counts: 0.07 at f/1000.
+At f/1.8 and f/100 for focal lengths of 4.3 mm, ideal or plano-convex, from 0.5 m to infinity (tests/stability); from
+f/5 for 50 mm (tests/optics/test_physics.py). Faster, aberrations send light where the Debye map does not hold: 0.5 for
+a plano-convex lens at f/1.4. Slower, pinholes spread it to angles at which obliquity counts: 0.07 at f/1000.
 """
 _ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
 
@@ -252,7 +253,8 @@ class Lens(nn.Module):
         return torch.stack(curves, dim=1)
 
     def _answer(self, query: Query, propagator: str, method: str | None) -> Tensor:
-        return choose(query, propagator=propagator, method=method)(query)
+        with full_precision(query.device):
+            return choose(query, propagator=propagator, method=method)(query)
 
     def encircled_energy(
         self,
