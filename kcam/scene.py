@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam import spectral
+from kcam.precision import full_precision
 from kcam.units import check_distances, check_positive, wavelength_grid
 
 
@@ -224,14 +225,16 @@ class Scene:
         """The whole cube of relative radiance, (B,L,H,W): 1.3 GB for 12 megapixels in 28 bands of float32."""
         if self.spectra is None:
             return self.coefficients
-        return torch.einsum("bkhw,kl->blhw", self.coefficients, self.spectra)
+        with full_precision(self.device):
+            return torch.einsum("bkhw,kl->blhw", self.coefficients, self.spectra)
 
     def xyz(self) -> Tensor:
         """The scene's colours, (B,3,H,W) CIE XYZ; `luminance` * Y is in cd/m^2. The cube is not formed."""
         weights = spectral.xyz_weights(self.wavelengths).to(self.coefficients)
-        if self.spectra is not None:
-            weights = self.spectra @ weights
-        return torch.einsum("bkhw,kc->bchw", self.coefficients, weights)
+        with full_precision(self.device):
+            if self.spectra is not None:
+                weights = self.spectra @ weights
+            return torch.einsum("bkhw,kc->bchw", self.coefficients, weights)
 
     def to_srgb(self) -> Tensor:
         """The picture that an ideal camera without lens would take, (B,3,H,W) sRGB clipped to [0,1], for looking at."""

@@ -537,7 +537,10 @@ def _check_vector(values: Tensor, *, name: str) -> None:
 def _check_finite(values: Tensor, *, name: str) -> None:
     bad = int((~torch.isfinite(values)).sum())
     if bad:
-        raise ValueError(f"{name} has {bad} values that are NaN or infinite; expected finite ones everywhere.")
+        raise ValueError(
+            f"{name} has {bad} values that are NaN or infinite; expected finite ones everywhere. Use "
+            f"torch.nan_to_num({name})."
+        )
 
 
 def _check_aperture(value: Scalar, *, name: str) -> None:

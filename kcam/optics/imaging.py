@@ -22,7 +22,8 @@ from kcam.context import Context, Stage
 from kcam.optics.lens import Lens
 from kcam.optics.propagation import PHYSICS, choose
 from kcam.optics.psf import Query, ray_displacement
-from kcam.optics.transforms import fast_length, full_precision
+from kcam.optics.transforms import fast_length
+from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 

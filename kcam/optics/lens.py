@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,6 +16,13 @@ from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
+TESTED_F_NUMBERS = (1.8, 100.0)
+"""Within these the non-paraxial PSF is held to Rayleigh-Sommerfeld, on the axis and within 1e-2.
+
+At f/1.8 and f/100 for focal lengths of 4.3 mm, ideal or plano-convex, from 0.5 m to infinity (tests/stability); from
+f/5 for 50 mm (tests/optics/test_physics.py). Faster, aberrations send light where the Debye map does not hold: 0.5 for
+a plano-convex lens at f/1.4. Slower, pinholes spread it to angles at which obliquity counts: 0.07 at f/1000.
+"""
 _ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
 
 
@@ -157,8 +165,9 @@ class Lens(nn.Module):
         Returns:   (Z, L, H, W), >= 0 up to the sampling error; sums to the share of light in the window.
         Raises:    ValueError for lengths that are not in metres, distances <= 0, an unknown propagator or method, a
             shape
-                   that is not two positive integers, or a pupil too coarse for the window (with the sampling that
-                   would do).
+                   that is not two positive integers, a pupil too coarse for the window (with the sampling that
+                   would do), or a lens whose parameters were trained or loaded into NaN.
+        Warns:     UserWarning for an f-number outside `TESTED_F_NUMBERS`.
         Valid on the axis, for thin elements and scalar light; the model's own error is `propagation.choose(...).error`.
         """
         query = self.query(
@@ -200,7 +209,9 @@ class Lens(nn.Module):
         grid = check_distances(distances).to(device)
         if grid.ndim > 1:
             raise ValueError(f"distances must be a number or a vector (Z,), got shape {tuple(grid.shape)}.")
+        self._check_trained()
         self._check_curvature()
+        self._check_f_number()
         return Query(
             lens=self,
             wavelengths=wavelength_grid(wavelengths),
@@ -352,6 +363,30 @@ class Lens(nn.Module):
                 f"Focus beyond {1 / power:g} m."
             )
         return 1 / image_vergence
+
+    def _check_trained(self) -> None:
+        """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
+        for name, value in (*self.named_parameters(), *self.named_buffers()):
+            bad = int((~torch.isfinite(value.detach())).sum())
+            if bad:
+                raise ValueError(
+                    f"{name} of the lens has {bad} values that are NaN or infinite; expected finite ones everywhere. "
+                    "Load values from before they were lost, and train with a smaller step."
+                )
+        check_positive(self.sensor_distance, name="sensor_distance")
+        check_positive(self.aperture.semi_aperture(), name="semi-aperture")
+
+    def _check_f_number(self) -> None:
+        (fastest, slowest), width = TESTED_F_NUMBERS, 2 * float(self.aperture.semi_aperture().detach())
+        if not fastest <= self.f_number <= slowest:
+            limits = (width * self.f_number / number * 1e3 for number in (slowest, fastest))
+            warnings.warn(
+                f"f/{self.f_number:.2g} is outside f/{fastest:g}..f/{slowest:g}, where PSFs were tested against "
+                "Rayleigh-Sommerfeld: computed all the same, but with an unknown error. An aperture of "
+                "{:.2g} to {:.2g} mm is within.".format(*limits),
+                UserWarning,
+                stacklevel=3,
+            )
 
     def _check_curvature(self) -> None:
         reach = float(self.aperture.semi_aperture().detach()) * (1 if self.round else math.sqrt(2))

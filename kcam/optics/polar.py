@@ -19,6 +19,9 @@ from kcam.optics.psf import Query, ray_displacement, residual_path, to_pixels
 from kcam.optics.pupil import Pupil, from_image_side
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
+_PANEL = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
+_MOST_RINGS = 2**20
+_RINGS_AT_ONCE = 2**24  # entries of the Hankel table: 128 MB
 
 
 def radial_psf(query: Query) -> Tensor:
@@ -44,8 +47,11 @@ def radial_psf(query: Query) -> Tensor:
     field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
 
     t = torch.arange(math.ceil(largest * corner / _TABLE_STEP) + 8, dtype=torch.float64, device=query.device)
-    table = _BesselJ0.apply(t[:, None] * _TABLE_STEP * rho)
-    transformed = 2 * math.pi * field @ table.T  # (2, L, Z, T)
+    parts = list(zip(*(part.split(max(1, _RINGS_AT_ONCE // t.numel()), dim=-1) for part in (field, rho)), strict=True))
+    if len(parts) == 1:
+        transformed = _hankel(field, t, rho)  # (2, L, Z, T)
+    else:  # the table of each part is built again in the backward pass, not kept
+        transformed = torch.stack([checkpoint(_hankel, f, t, r, use_reentrant=False) for f, r in parts]).sum(0)
 
     bands = []
     for index, wavelength in enumerate(query.wavelengths.tolist()):
@@ -58,6 +64,11 @@ def radial_psf(query: Query) -> Tensor:
         factor = (a * query.pixel_pitch / (wavelengths[index] * d)) ** 2 / energy
         bands.append(image * factor[:, None, None].to(query.dtype))
     return torch.stack(bands, dim=1)
+
+
+def _hankel(field: Tensor, t: Tensor, rho: Tensor) -> Tensor:
+    """2 pi SUM field J0(t rho) at the table's arguments: (..., n) -> (..., T)."""
+    return 2 * math.pi * field @ _BesselJ0.apply(t[:, None] * _TABLE_STEP * rho).T
 
 
 class _BesselJ0(torch.autograd.Function):
@@ -76,12 +87,27 @@ class _BesselJ0(torch.autograd.Function):
 
 def ring_nodes(query: Query, count: int) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes and weights over the open part of the radius, image-side coordinates."""
-    nodes, weights = (torch.as_tensor(v, device=query.device) for v in np.polynomial.legendre.leggauss(count))
+    if count > _MOST_RINGS:
+        raise ValueError(
+            f"this PSF needs {count} rings of the pupil, more than {_MOST_RINGS}: rays at the rim of the lens are sent "
+            "too far beyond the window. Use a smaller aperture or a larger radius of curvature."
+        )
+    nodes, weights = (torch.as_tensor(v, device=query.device) for v in _legendre(count))
     discs = query.lens.aperture.discs()
     inner = torch.zeros_like(query.tau) + (discs[1][0] if len(discs) > 1 else 0.0)
     if len(discs) > 1:
         inner = inner * torch.sqrt((1 + query.tau) / (1 + query.tau * inner**2))
     return inner + (1 - inner) * (nodes + 1) / 2, weights * (1 - inner) / 2
+
+
+@functools.lru_cache(maxsize=16)
+def _legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes and weights on [-1, 1]: one rule, or panels of one rule that together resolve as much."""
+    panels = math.ceil(count / _PANEL)
+    order = count if panels == 1 else math.ceil(count / panels) + 32
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    centres = (2 * np.arange(panels) + 1) / panels - 1
+    return (centres[:, None] + nodes / panels).ravel(), np.tile(weights / panels, panels)
 
 
 def ring_amplitude(query: Query, pupil: Pupil, quadrature: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,7 @@ from kcam.optics.psf import Query, grid_psf, grid_samples, ray_displacement
 from kcam.optics.rays import geometric_psf
 from kcam.optics.reference import reference_psf
 from kcam.optics.transforms import fast_length
+from kcam.precision import full_precision
 
 _FFT_SLOWNESS = 10.0  # operations of a matrix product in the time of one of an FFT, measured on a CPU in float32
 
@@ -60,7 +61,8 @@ class Propagator(nn.Module):
         reason = self.valid_for(query)
         if reason is not None:
             raise ValueError(f"{self.physics}/{self.method} {reason}")
-        return self.function(query)
+        with full_precision(query.device):
+            return self.function(query)
 
     def error(self, query: Query) -> float:
         """Estimated L1 error before anything is computed."""

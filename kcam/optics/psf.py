@@ -388,8 +388,7 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     widths = [1.0 if pixels.half_width is None else float(pixels.half_width) / semi for pixels in maps]
     sizes = [pixels.values.shape[-1] for pixels in maps]
     # cells in which every map's pixels are whole, where there are such: a map that ends inside the aperture continues
-    # with
-    # its outermost pixels, one that reaches beyond it is cut off by the aperture
+    # with its outermost pixels, and of one that reaches beyond it only the pixels that the aperture touches are kept
     finest = max(range(len(maps)), key=lambda i: sizes[i] / widths[i])
     base, half_width = sizes[finest], widths[finest]
     common = math.lcm(*(size for size, width in zip(sizes, widths, strict=True) if width == half_width))
@@ -398,7 +397,7 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     if discs or len(maps) > 1:
         most = max(_MOST_CELLS, 2 * count) / base
         refine = max(1, math.ceil(min(query.cells_per_sample * count * half_width / base, most)))
-    missing = max(0, math.ceil((1 - half_width) * base / (2 * half_width) - 1e-9))
+    missing = math.ceil((1 - half_width) * base / (2 * half_width) - 1e-9)  # on each side; < 0: to leave out
     cells = (base + 2 * missing) * refine
     half_width *= (base + 2 * missing) / base
 

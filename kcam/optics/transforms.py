@@ -8,7 +8,6 @@ otherwise hold every pupil in memory).
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,8 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+
+from kcam.precision import full_precision
 
 Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
 
@@ -33,18 +34,6 @@ def fast_length(minimum: int) -> int:
         if rest == 1:
             return length
         length += step
-
-
-@contextlib.contextmanager
-def full_precision(device: torch.device) -> Iterator[None]:
-    """No autocast and no reduced-precision matrix products: their 1e-3 would be read as light (restored on exit)."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")
-    try:
-        with torch.autocast(device.type, enabled=False):
-            yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 class Transform(Protocol):

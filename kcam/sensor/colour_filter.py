@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from kcam import spectral
 from kcam.context import Context, Stage
+from kcam.precision import full_precision
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import hold
 from kcam.units import nm, wavelength_grid
@@ -286,7 +287,8 @@ class ColourFilter(Stage):
             raise ValueError(f"expected bands (..., L, H, W), got shape {tuple(signal.shape)}.")
         _check_bands(signal.shape[-3], wavelengths, "the signal has")
         weights = self.contraction(wavelengths).to(signal)
-        return self.finish(torch.einsum("kl,...lhw->...khw", weights, signal))
+        with full_precision(signal.device):
+            return self.finish(torch.einsum("kl,...lhw->...khw", weights, signal))
 
     def provides(self) -> dict[str, ColourFilter]:
         """Itself, for exposure, white balance and colour matrix."""

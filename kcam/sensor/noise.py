@@ -27,6 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam.context import Context, Stage
+from kcam.precision import full_precision
 from kcam.ste import clip_ste
 from kcam.units import check_positive
 
@@ -64,7 +65,8 @@ def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
                 "divide by the largest value, such as image / 255."
             )
         working = signal.float() if signal.dtype in (torch.float16, torch.bfloat16) else signal
-        return function(working, **arguments).to(signal.dtype)
+        with full_precision(signal.device):
+            return function(working, **arguments).to(signal.dtype)
 
     return wrapper
 
