@@ -140,8 +140,8 @@ def test_hard_cases_of_kcam_end_in_the_right_picture_or_an_error():
             assert row["message"].startswith("ValueError")
         else:
             assert row["outcome"] == "finite"
-            # the angular spectrum's hard rim costs 6e-4 at this pitch
-            assert row["l1"] < (1e-3 if row["how"] == "angular_spectrum" else 2e-5), row
+            # float32 keeps 4e-7 of each picture; the angular spectrum's sampled rim costs 6e-4 at this pitch
+            assert row["l1"] < (1e-3 if row["how"] == "angular_spectrum" else 2e-6), row
             assert row["energy"] == pytest.approx(row["true_energy"], rel=1e-3)
 
 
