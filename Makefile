@@ -1,6 +1,7 @@
-# make demo | test | test-all | bench | check | wheel-test | clean.   Everything is installed into .venv, once.
+# make demo | test | test-all | bench | bench-peers | check | wheel-test | clean.   All is installed into .venv, once.
 PYTHON ?= python3
 VENV ?= .venv
+PEERS ?= .venv-peers
 BIN := $(VENV)/bin
 PIP_INSTALL := -m pip --disable-pip-version-check install -qq --constraint constraints.txt
 PIP := $(BIN)/python $(PIP_INSTALL)
@@ -9,7 +10,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all bench lint types check wheel-test clean
+.PHONY: help demo test test-slow test-all bench bench-peers lint types check wheel-test clean
 
 help:
 	@head -1 Makefile
@@ -40,6 +41,18 @@ test-all: $(VENV)/dev.stamp
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.bench
 
+# The peers come with dependencies of their own, so they get an environment of their own.
+$(PEERS)/peers.stamp: pyproject.toml constraints.txt benchmarks/peers.txt
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python $(PIP_INSTALL) torch==2.13.0
+	$(PEERS)/bin/python $(PIP_INSTALL) --editable .
+	for peer in $$(grep -v '^#' benchmarks/peers.txt); do \
+	    $(PEERS)/bin/python $(PIP_INSTALL) $$peer || echo "$$peer does not install here and is skipped"; done
+	@touch $@
+
+bench-peers: $(PEERS)/peers.stamp
+	OMP_NUM_THREADS=1 $(PEERS)/bin/python -m benchmarks.peers
+
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
 
@@ -62,4 +75,4 @@ wheel-test: $(VENV)/core.stamp
 	rm -rf .wheel-test
 
 clean:
-	rm -rf $(VENV) .wheel-test build dist demo
+	rm -rf $(VENV) $(PEERS) .wheel-test build dist demo

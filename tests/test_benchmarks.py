@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import math
 import sys
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
+import oracles
 import pytest
 import torch
+from rich.console import Console
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from benchmarks import bench
+from benchmarks import bench, peers
 from benchmarks.common import Contestant, race
 
 
@@ -77,3 +81,84 @@ def test_a_target_is_met_only_when_fast_and_the_same(ratio, difference, met):
     row |= {"error": {"relative_max": difference}, "error_ratio": None}
     target = bench.Target("cube", "render cube", 2, same_to=1e-5)
     assert [verdict["met"] for verdict in target.judge([row])] == [met]
+
+
+# ---- beside the peers ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def beside_peers(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    path = tmp_path_factory.mktemp("peers") / "peers.json"
+    assert peers.main(["--quick", "--out", str(path)]) == 0
+    return json.loads(path.read_text())
+
+
+def test_kcam_and_the_textbook_run_where_no_peer_is_installed(beside_peers):
+    rows = beside_peers["accuracy"]
+    assert {"textbook", "kcam"} <= {row["library"] for row in rows}
+    assert {row["library"] for row in rows} | beside_peers["skipped"].keys() == {"textbook", "kcam", *peers.PEERS}
+    for row in rows:
+        assert row["seconds"] > 0
+        # 64 samples in the textbook's hard-edged pupil are good to 1.2e-2; kcam's own choice promises 1e-3 here
+        assert row["error"]["l1"] < (1e-3 if row["library"] == "kcam" else 3e-2), row["who"]
+
+
+def test_more_samples_are_closer(beside_peers):
+    error = {(row["who"], row["dtype"]): row["error"]["l1"] for row in beside_peers["accuracy"]}
+    for dtype in ("float32", "float64"):
+        assert error["kcam matrix, 512 samples", dtype] < error["kcam matrix, its own samples", dtype] / 10
+
+
+def test_an_absent_peer_is_skipped_with_a_line():
+    console = Console(record=True, width=200)
+    versions, skipped = peers.find_peers(console, ("no_such_optics", "rich"))
+    assert versions.keys() == {"rich"}
+    assert "No module named 'no_such_optics'" in skipped["no_such_optics"]
+    assert "no_such_optics is skipped" in console.export_text()
+
+
+@pytest.mark.parametrize("case", [peers.QUICK, replace(peers.QUICK, vergence=1.0)])
+def test_the_truth_is_the_diffraction_integral_in_two_dimensions(case):
+    x = oracles.pixel_centres(case.window, case.pitch)
+    image = oracles.fresnel_image(
+        x,
+        x,
+        aperture_radius=case.diameter / 2,
+        sensor_distance=case.distance,
+        wavelength=peers.WAVELENGTH,
+        opd=lambda u, v: case.residual(u**2 + v**2),
+    )
+    torch.testing.assert_close(peers.truth(case), torch.from_numpy(image) * case.pitch**2, rtol=1e-9, atol=1e-14)
+
+
+def test_hard_cases_of_kcam_end_in_the_right_picture_or_an_error():
+    rows = peers.hard_rows([])
+    assert len({row["case"] for row in rows}) == 5
+    for row in rows:
+        if row["case"] == "zero aperture" or "512 samples" in row["how"]:
+            assert row["outcome"] == "raises"
+            assert row["message"].startswith("ValueError")
+        else:
+            assert row["outcome"] == "finite"
+            # float32 keeps 4e-7 of each picture; the angular spectrum's sampled rim costs 6e-4 at this pitch
+            assert row["l1"] < (1e-3 if row["how"] == "angular_spectrum" else 2e-6), row
+            assert row["energy"] == pytest.approx(row["true_energy"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("picture", "found"),
+    [([1.0, 3.0], "finite"), ([1.0, math.nan], "NaN"), ([1.0, math.inf], "NaN"), (None, "raises")],
+)
+def test_what_came_of_a_hard_case_is_said(picture, found):
+    def prepare() -> tuple:
+        if picture is None:
+            raise ArithmeticError("no light")
+        warnings.warn("thin ice", stacklevel=1)
+        return (lambda: torch.tensor(picture)), 0.5
+
+    row = peers.outcome(prepare, torch.tensor([1.0, 1.0], dtype=torch.float64))
+    assert row["outcome"] == found
+    assert row["energy"] == (2.0 if found == "finite" else None)
+    assert row["l1"] == (0.5 if found == "finite" else None)
+    assert row["message"] == ("ArithmeticError: no light" if picture is None else None)
+    assert row["warnings"] == ([] if picture is None else ["UserWarning: thin ice"])

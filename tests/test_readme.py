@@ -340,6 +340,8 @@ def test_numbers_of_the_benchmarks_stand_in_the_readme() -> None:
     for path in generate.RESULTS.glob("*.json"):
         rows = json.loads(path.read_text()).get("rows", [])
         ours = [row for row in rows if row.get("default")]
+        if not ours:  # peers.json, which has a table of its own
+            continue
         for row in ours:
             assert generate.figures(row["ratio"]) in table
             assert row["op"] in table
