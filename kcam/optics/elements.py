@@ -141,7 +141,8 @@ class AnnularAperture(Aperture):
         return float64(self.diameter) / 2
 
     def discs(self) -> tuple[tuple[float, float], ...]:
-        return ((1.0, 1.0), (self.obscuration, -1.0)) if self.obscuration else ((1.0, 1.0),)
+        # below 1e-8 its area is beyond float64's digits, and far below, 1 / obscuration^2 overflows
+        return ((1.0, 1.0), (self.obscuration, -1.0)) if self.obscuration > 1e-8 else ((1.0, 1.0),)
 
     def open_share(self) -> float:
         return torch.pi / 4 * (1 - self.obscuration**2)

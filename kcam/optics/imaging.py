@@ -43,7 +43,8 @@ class Imaging(Stage):
     Args:
         lens: the optics.
         pixel_pitch: [m]. fill_factor: light-sensitive share of a pixel; the irradiance is its mean over that square.
-        propagator, method: as in `Lens.psf`.
+        propagator, method, samples: as in `Lens.psf`. A number of samples freezes the pupil grid, which otherwise
+            follows the parameters in steps: give it together with psf_shape where a camera is differenced.
         psf_shape: (H, W) of the PSF's window in pixels; None: see `psf_window`.
         layers: number of depth layers over the range of a depth map; None: see `depth_layers`.
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
@@ -60,6 +61,7 @@ class Imaging(Stage):
         pixel_pitch: float = 4e-6,
         propagator: str = "nonparaxial",
         method: str | None = None,
+        samples: int | None = None,
         psf_shape: tuple[int, int] | None = None,
         layers: int | None = None,
         border: str = "reflect",
@@ -82,7 +84,7 @@ class Imaging(Stage):
             raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory:g}.")
         self.lens = lens
         self.pixel_pitch = check_pixel_pitch(pixel_pitch)
-        self.propagator, self.method = propagator, method
+        self.propagator, self.method, self.samples = propagator, method, samples
         self.psf_shape = None if psf_shape is None else (int(psf_shape[0]), int(psf_shape[1]))
         self.layers, self.border, self.fill_factor = layers, border, fill_factor
         self.distance, self.max_memory = distance, float(max_memory)
@@ -176,6 +178,7 @@ class Imaging(Stage):
             distances=distances,
             pixel_pitch=self.pixel_pitch,
             shape=shape,
+            samples=self.samples,
             fill_factor=self.fill_factor,
             dtype=like.dtype,
             device=like.device,
@@ -193,7 +196,7 @@ class Imaging(Stage):
         return self._bank_cache.get(self._optics_key(wavelengths, vergences, shape, like), build)
 
     def _optics_key(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> tuple:
-        names = (self.propagator, self.method, self.pixel_pitch, self.fill_factor)
+        names = (self.propagator, self.method, self.samples, self.pixel_pitch, self.fill_factor)
         return (fingerprint(self.lens), names, wavelengths, vergences, shape, str(like.dtype), str(like.device))
 
     # ---- rendering -------------------------------------------------------------------------------------------------

@@ -521,7 +521,9 @@ def test_a_window_is_never_larger_than_the_picture_and_always_odd() -> None:
 
 def fresh(stage: optics.Imaging) -> optics.Imaging:
     """A new stage with the same optics and nothing kept."""
-    names = ("pixel_pitch", "propagator", "method", "psf_shape", "layers", "border", "fill_factor", "distance")
+    names = (
+        "pixel_pitch", "propagator", "method", "samples", "psf_shape", "layers", "border", "fill_factor", "distance",
+    )  # fmt: skip
     new = optics.Imaging(copy.deepcopy(stage.lens), **{name: getattr(stage, name) for name in names})
     return new
 
@@ -570,6 +572,10 @@ def change_the_fill_factor(stage: optics.Imaging) -> None:
     stage.fill_factor = 0.3
 
 
+def change_the_samples(stage: optics.Imaging) -> None:
+    stage.samples = 40  # coarse: kappa 1.5 in this window
+
+
 def change_the_elements(stage: optics.Imaging) -> None:
     stage.lens.elements.append(optics.Defocus(0.4))
 
@@ -582,7 +588,7 @@ SCENE = cube(size=(24, 24), bands=4, depth=1.2)
 CHANGES = [
     change_data, change_one_pixel, change_by_a_step, change_by_loading, change_a_float, change_the_glass,
     change_the_sensor, change_the_pitch, change_the_physics, change_the_fill_factor, change_the_elements,
-    change_the_levels,
+    change_the_levels, change_the_samples,
 ]  # fmt: skip
 
 

@@ -153,6 +153,16 @@ def test_annular_aperture(method: str, bound: float, obscuration: float) -> None
     assert error <= (3 if obscuration > 0.5 else 1) * bound  # a thin ring has less light for the same rim
 
 
+@pytest.mark.parametrize("obscuration", [1e-8, 1e-160, 5e-324])  # 1 / obscuration^2 overflows
+def test_an_invisible_obscuration_is_none(obscuration: float) -> None:
+    doe = optics.DOE(smooth_map())
+    ring, disc = (
+        image(optics.Lens(stop, optics.ThinLens(FOCAL), doe, sensor_distance=FOCAL), 9)
+        for stop in (optics.AnnularAperture(2 * mm, obscuration=obscuration), optics.CircularAperture(2 * mm))
+    )
+    assert np.array_equal(ring, disc)
+
+
 @pytest.mark.parametrize("method", ["matrix", "chirp_z", "fft"])
 def test_square_aperture(method: str) -> None:
     psf = through(optics.SquareAperture(4 * mm), method=method)
