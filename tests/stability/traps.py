@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -335,9 +336,10 @@ def close_to_the_sphere() -> Row:
     lens = optics.Lens(
         optics.CircularAperture(2 * semi), optics.PlanoConvexLens(parameter, glass=INDEX), sensor_distance=distance
     )
-    (ours,) = torch.autograd.grad(
-        (_psf(lens, distances=math.inf, size=size, pixel_pitch=pitch, samples=1024) * weights).sum(), parameter
-    )
+    with warnings.catch_warnings():  # f/1.1 is beyond the f-numbers that were tested, which is the point here
+        warnings.simplefilter("ignore", UserWarning)
+        psf = _psf(lens, distances=math.inf, size=size, pixel_pitch=pitch, samples=1024)
+    (ours,) = torch.autograd.grad((psf * weights).sum(), parameter)
     errors = (abs(float(value) / truth - 1) for value in (naive, ours))
     return Row(
         "corners beyond the sphere, aperture 0.95 R", "where(inside, sqrt(R^2 - r^2), 0)",
