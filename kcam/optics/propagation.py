@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from kcam.optics import sampling
-from kcam.optics.psf import Query, grid_psf, grid_samples, ray_displacement, residual_path, to_pixels
+from kcam.optics.psf import Query, grid_psf, ray_displacement, residual_path, samples_by_rule, to_pixels
 from kcam.optics.pupil import Pupil, disc_weights, from_image_side, unfold_quadrant
 from kcam.optics.transforms import fast_length
 
@@ -476,11 +476,11 @@ def _grid_error(query: Query) -> float:
 
 
 def _grid_sizes(query: Query) -> list[tuple[int, int]]:
-    """(pupil samples, points) of each wavelength."""
-    displacement = ray_displacement(query)
+    """(pupil samples, points) of each wavelength, also where so many would be refused: a cost is no refusal."""
+    displacement = ray_displacement(query).tolist()
     return [
         (
-            grid_samples(query, displacement=displacement, wavelength=wavelength, index=index),
+            query.samples or samples_by_rule(query, displacement=displacement[index], wavelength=wavelength),
             2 * query.evaluation_grid(wavelength)[1] + 1,
         )
         for index, wavelength in enumerate(query.wavelengths.tolist())
