@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from kcam.optics import sampling
 from kcam.optics.angular_spectrum import angular_spectrum_psf
 from kcam.optics.polar import radial_psf
-from kcam.optics.psf import Query, grid_psf, grid_samples, ray_displacement
+from kcam.optics.psf import Query, grid_psf, ray_displacement, samples_by_rule
 from kcam.optics.rays import geometric_psf
 from kcam.optics.reference import reference_psf
 from kcam.optics.transforms import fast_length
@@ -128,11 +128,11 @@ def _grid_error(query: Query) -> float:
 
 
 def _grid_sizes(query: Query) -> list[tuple[int, int]]:
-    """(pupil samples, points) of each wavelength."""
-    displacement = ray_displacement(query)
+    """(pupil samples, points) of each wavelength, also where so many would be refused: a cost is no refusal."""
+    displacement = ray_displacement(query).tolist()
     return [
         (
-            grid_samples(query, displacement=displacement, wavelength=wavelength, index=index),
+            query.samples or samples_by_rule(query, displacement=displacement[index], wavelength=wavelength),
             2 * query.evaluation_grid(wavelength)[1] + 1,
         )
         for index, wavelength in enumerate(query.wavelengths.tolist())

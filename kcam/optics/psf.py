@@ -205,21 +205,31 @@ def grid_psf(query: Query, *, method: str) -> Tensor:
     return torch.stack(bands, dim=1)
 
 
+def samples_by_rule(query: Query, *, displacement: float, wavelength: float) -> int:
+    """Pupil samples by the rule of `sampling.pupil_samples`, however many."""
+    geometry = _geometry(query, displacement=displacement, wavelength=wavelength)
+    needed = sampling.pupil_samples(**geometry, kappa=query.kappa)
+    # with a map few distinct grids: each needs weights of its own
+    return 64 * math.ceil(needed / 64) if query.lens.has_pixel_phase else needed
+
+
+def _geometry(query: Query, *, displacement: float, wavelength: float) -> dict[str, float]:
+    return {
+        "semi_aperture": float(query.image_side_semi_aperture.detach()),
+        "sensor_distance": float(query.sensor_distance.detach()),
+        "wavelength": wavelength,
+        "half_window": query.half_window,
+        "displacement": displacement,
+    }
+
+
 def grid_samples(query: Query, *, displacement: Tensor, wavelength: float, index: int) -> int:
     """Pupil samples for one wavelength: the rule's, or the user's after a check that no replica enters the window.
 
     Raises: ValueError with the sampling that would do.
     """
-    geometry = {
-        "semi_aperture": float(query.image_side_semi_aperture.detach()),
-        "sensor_distance": float(query.sensor_distance.detach()),
-        "wavelength": wavelength,
-        "half_window": query.half_window,
-        "displacement": float(displacement[index]),
-    }
-    needed = sampling.pupil_samples(**geometry, kappa=query.kappa)
-    if query.lens.has_pixel_phase:
-        needed = 64 * math.ceil(needed / 64)  # few distinct grids: each needs weights of its own for the map
+    geometry = _geometry(query, displacement=float(displacement[index]), wavelength=wavelength)
+    needed = samples_by_rule(query, displacement=float(displacement[index]), wavelength=wavelength)
     if query.samples is None:
         if needed > sampling.MAX_PUPIL_SAMPLES:
             raise ValueError(
