@@ -12,6 +12,8 @@ from kcam.optics.psf import Query, ray_displacement, residual_path, to_pixels
 from kcam.optics.pupil import Pupil, pixel_under, round_weights, unfold_quadrant
 from kcam.optics.transforms import fast_length
 
+MOST_SAMPLES = 8192
+
 
 def angular_spectrum_psf(query: Query) -> Tensor:
     """PSFs by the band-limited angular spectrum of the field behind the lens, which must sample the converging wave.
@@ -21,26 +23,49 @@ def angular_spectrum_psf(query: Query) -> Tensor:
     Source: Goodman, Introduction to Fourier Optics, angular spectrum; Matsushima and Shimobaba, Opt. Express 17, 19662
         (2009).
     """
-    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
-    displacement = ray_displacement(query)
     bands = []
-    for index, wavelength in enumerate(query.wavelengths.tolist()):
-        spread = float(displacement[index])
-        # from the rim light goes to the far edge of the window, and a little further: its cycles per metre in the grid
-        across = a + max(query.half_window, spread) + 10 * wavelength * d / (2 * a)
-        steepest = across / math.hypot(across, d) / wavelength
-        pitch = 1 / (2.2 * steepest)
-        # beyond the rays the rim diffracts light into tails, which must not wrap around into the window
-        tails = 50 * wavelength * d / (2 * a)
-        count = fast_length(math.ceil(1.25 * (2 * a + 2 * max(query.half_window, spread) + 2 * tails) / pitch))
-        count += count % 2
-        if count > 8192:
-            raise ValueError(
-                f"angular_spectrum needs a grid of {count} at {wavelength * 1e9:.4g} nm to sample the wave that "
-                f"converges from {2 * a * 1e3:g} mm; use propagator='nonparaxial', which samples the residual only."
-            )
+    for index, (count, pitch) in enumerate(spectrum_grids(query)):
+        if count > MOST_SAMPLES:
+            raise ValueError(f"angular_spectrum {too_many(count)}")
         bands.append(_spectrum_band(query, index, count=count, pitch=pitch))
     return torch.stack(bands, dim=1)
+
+
+def too_many(count: int) -> str:
+    """Why a grid is refused."""
+    return (
+        f"needs a grid of {count} to sample the wave that converges from the aperture, more than {MOST_SAMPLES}; use "
+        "propagator='nonparaxial', which samples the residual only."
+    )
+
+
+def spectrum_grids(query: Query) -> list[tuple[int, float]]:
+    """(samples, pitch [m]) behind the lens for each wavelength; `Query.samples` spread over the same width instead.
+
+    Raises: ValueError for samples too few to sample the converging wave at the rim.
+    """
+    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
+    grids = []
+    for wavelength, spread in zip(query.wavelengths.tolist(), ray_displacement(query).tolist(), strict=True):
+        # from the rim light goes to the far edge of the window, and a little further: its cycles per metre in the grid
+        reach = max(query.half_window, spread)
+        across = a + reach + 10 * wavelength * d / (2 * a)
+        steepest = across / math.hypot(across, d) / wavelength
+        # beyond the rays the rim diffracts light into tails, which must not wrap around into the window
+        tails = 50 * wavelength * d / (2 * a)
+        width = 1.25 * (2 * a + 2 * reach + 2 * tails)
+        count = fast_length(math.ceil(width * 2.2 * steepest))
+        count += count % 2
+        pitch = 1 / (2.2 * steepest)
+        if query.samples is not None:
+            count, pitch = query.samples + query.samples % 2, width / query.samples
+            if pitch > 1 / (2 * a / math.hypot(a, d) / wavelength):
+                raise ValueError(
+                    f"{query.samples} samples are too coarse for angular_spectrum at {wavelength * 1e9:.4g} nm: the "
+                    f"wave that converges from the rim would alias. Use samples >= {math.ceil(width * 2 * steepest)}."
+                )
+        grids.append((count, pitch))
+    return grids
 
 
 def _spectrum_band(query: Query, index: int, *, count: int, pitch: float) -> Tensor:

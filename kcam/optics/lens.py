@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam.optics.elements import DOE, Aperture, Element, PlanoConvexLens, Scalar, float64, set_scalar
+from kcam.optics.explain import Explanation, explain
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
@@ -168,7 +169,7 @@ class Lens(nn.Module):
                    that is not two positive integers, a pupil too coarse for the window (with the sampling that
                    would do), or a lens whose parameters were trained or loaded into NaN.
         Warns:     UserWarning for an f-number outside `TESTED_F_NUMBERS`.
-        Valid on the axis, for thin elements and scalar light; the model's own error is `propagation.choose(...).error`.
+        Valid on the axis, for thin elements and scalar light; `explain` estimates the error.
         """
         query = self.query(
             wavelengths,
@@ -181,6 +182,38 @@ class Lens(nn.Module):
             dtype=dtype,
         )
         return choose(query, propagator=propagator, method=method)(query)
+
+    def explain(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        propagator: str = "nonparaxial",
+        method: str | None = None,
+        samples: int | None = None,
+        fill_factor: float = 1.0,
+        integrate: bool = True,
+        dtype: torch.dtype = torch.float32,
+    ) -> Explanation:
+        """What `psf` will do with the same arguments: the row, its sampling, its error, and the energy in the window.
+
+        Args: those of `psf`.
+        Returns: a value to print; its fields are the numbers. Errors are estimated without computing the PSFs: never
+            more than 3 times too small, down to 1e-6, over random cameras. The captured energy is computed.
+        """
+        query = self.query(
+            wavelengths,
+            distances=distances,
+            pixel_pitch=pixel_pitch,
+            shape=shape,
+            samples=samples,
+            fill_factor=fill_factor,
+            integrate=integrate,
+            dtype=dtype,
+        )
+        return explain(query, propagator=propagator, method=method)
 
     def query(
         self,

@@ -10,15 +10,15 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-import torch
 from torch import Tensor, nn
 
-from kcam.optics import sampling
-from kcam.optics.angular_spectrum import angular_spectrum_psf
+from kcam.optics.angular_spectrum import MOST_SAMPLES, angular_spectrum_psf, spectrum_grids, too_many
+from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, trace
 from kcam.optics.polar import radial_psf
-from kcam.optics.psf import Query, grid_psf, ray_displacement, samples_by_rule
+from kcam.optics.psf import Query, fft_grid, grid_psf, ray_displacement, samples_by_rule
+from kcam.optics.pupil import EDGE_MARGIN
 from kcam.optics.rays import geometric_psf
-from kcam.optics.reference import reference_psf
+from kcam.optics.reference import PIXELS_LIMIT, SMOOTH_LIMIT, reference_psf
 from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 
@@ -32,7 +32,7 @@ class Propagator(nn.Module):
         physics: what the user names as `propagator`. method: what the user names as `method`.
         function: Query -> (Z, L, H, W). paraxial: the model drops what spheres have beyond their parabolas.
         valid: returns why the row cannot answer a query, or None.
-        error: estimated L1 error of the PSF against Rayleigh-Sommerfeld. cost: floating-point operations.
+        error: estimated L1 error of the PSF against the reference row. cost: floating-point operations.
         exact: whether only sampling separates the row from its physics, so that it may be chosen by cost alone.
     """
 
@@ -64,9 +64,21 @@ class Propagator(nn.Module):
         with full_precision(query.device):
             return self.function(query)
 
+    @property
+    def on_grid(self) -> bool:
+        """Whether the row samples the pupil on a Cartesian grid, of so many samples as `Query.samples` says."""
+        return self.method in ("matrix", "chirp_z")
+
     def error(self, query: Query) -> float:
-        """Estimated L1 error before anything is computed."""
+        """Estimated L1 error of the worst PSF of a query against the `reference` row, before anything is computed.
+
+        Never more than 3 times too small (above 1e-6), 4 times too large in the median of random cameras.
+        """
         return self.error_of(replace(query, paraxial=self.paraxial))
+
+    def model_error(self, query: Query) -> float:
+        """Estimated L1 error that the reference itself has against Rayleigh-Sommerfeld, on the axis."""
+        return _debye_error(query)
 
     def cost(self, query: Query) -> float:
         """Estimated floating-point operations, weighted by how fast the row's kind of work runs."""
@@ -81,50 +93,53 @@ def wave_front_error(query: Query) -> float:
     return a**4 / (8 * d**3 * float(query.wavelengths.min()))
 
 
-def _sampling_error(query: Query) -> float:
-    """Worst L1 error of a Cartesian grid at the query's kappa, 10^(0.5 - 1.31 kappa), down to a floor for float32.
+def _debye_error(query: Query) -> float:
+    """0.013 w4: what the Debye map itself is off Rayleigh-Sommerfeld (numerics note, section 3)."""
+    return 0.013 * wave_front_error(query)
 
-    Fitted to the worst of 36 configurations in the numerics note, section 5.1 (3.5e-2 at kappa 1.5, 9e-5 at 3.5).
-    """
-    kappa = query.kappa
-    if query.samples is not None:
+
+def _paraxial_error(rays: Rays, query: Query) -> float:
+    """What dropping the spheres' higher terms costs: the rms of their phase, and of the scale of the pattern."""
+    tau = float(query.semi_aperture.detach() / query.sensor_distance.detach()) ** 2
+    return rays.beyond + tau if query.paraxial else 0.0
+
+
+def _grid_estimate(method: str) -> Callable[[Query], float]:
+    def estimate(query: Query) -> float:
         displacement = ray_displacement(query)
-        kappa = min(
-            sampling.kappa_of(
-                query.samples,
-                semi_aperture=float(query.image_side_semi_aperture.detach()),
-                sensor_distance=float(query.sensor_distance.detach()),
-                wavelength=wavelength,
-                half_window=query.half_window,
-                displacement=float(displacement[index]),
-            )
-            for index, wavelength in enumerate(query.wavelengths.tolist())
-        )
-    return max(10 ** (0.5 - 1.31 * kappa), 1e-12 if query.dtype == torch.float64 else 1e-6)
+        d, semi = (float(v.detach()) for v in (query.sensor_distance, query.image_side_semi_aperture))
+        worst = 0.0
+        for rays in trace(query):
+            index = int((query.wavelengths - rays.wavelength).abs().argmin())
+            spread = float(displacement[index])
+            if method == "fft":
+                per_pixel, reach = query.evaluation_grid(rays.wavelength)
+                step = query.pixel_pitch / per_pixel
+                shortest = max(math.ceil(2 * query.kappa * (query.half_window + spread) / step), 2 * reach + 1)
+                _, length, _ = fft_grid(2 * math.pi * semi * step / (rays.wavelength * d), shortest=shortest)
+                period = length * step
+            else:
+                count = query.samples or samples_by_rule(query, displacement=spread, wavelength=rays.wavelength)
+                period = rays.wavelength * d * (count - 2 * EDGE_MARGIN) / (2 * semi)
+            rounding = ROUNDING[query.dtype] * (5 if method == "fft" else 1)
+            error = grid_error(query, rays, period=period) + _paraxial_error(rays, query)
+            worst = max(worst, rounding + error)
+        return min(2.0, worst)
+
+    return estimate
 
 
-def _model_error(query: Query) -> float:
-    """3 w4 for the paraxial model, 0.013 w4 with the Debye map (numerics note, section 3)."""
-    return min(2.0, (3.0 if query.paraxial else 0.013) * wave_front_error(query))
+def _radial_estimate(query: Query) -> float:
+    """Interpolation in the Hankel table, 2e-7 measured, and the model."""
+    return min(2.0, 3e-7 + max(_paraxial_error(rays, query) for rays in trace(query)))
 
 
-def _map_error(query: Query) -> float:
-    """What flat pixels add where their jumps are large: curved edges taken in blocks, and cells cut by the rim.
+def _spectrum_estimate(query: Query) -> float:
+    """1e-3 for a smooth pupil; pixels are looked up at the grid's points, which misplaces every jump by up to half one.
 
-    The worst of white noise of 6 radians on 101..301 pixels at f/10 and f/5 (tests/optics/test_physics.py).
+    White noise of 6 radians is then off by 0.3, a square rim by 1e-2.
     """
-    if not query.lens.has_pixel_phase:
-        return 0.0
-    return 1.5e-3 if query.paraxial else 4e-3
-
-
-def _spectrum_error(query: Query) -> float:
-    """3e-3 for smooth pupils; a pixel map is looked up at the grid's points, and white noise is then off by 0.2."""
-    return 3e-3 + _model_error(query) + (0.25 if query.lens.has_pixel_phase else 0.0)
-
-
-def _grid_error(query: Query) -> float:
-    return min(2.0, _sampling_error(query) + _model_error(query) + _map_error(query))
+    return 1e-3 + (7e-3 if not query.lens.round else 0.0) + 0.12 * jumps(query)
 
 
 def _grid_sizes(query: Query) -> list[tuple[int, int]]:
@@ -163,12 +178,26 @@ def _fft_cost(query: Query) -> float:
     return query.vergences.numel() * total
 
 
+def _spectrum_cost(query: Query) -> float:
+    query = replace(query, samples=None)  # a cost is no refusal
+    total = sum(_FFT_SLOWNESS * 10 * n**2 * math.log2(n) for n, _ in spectrum_grids(query))
+    return query.vergences.numel() * total
+
+
 def _radial_cost(query: Query) -> float:
     return query.vergences.numel() * sum(40.0 * m * m for _, m in _grid_sizes(query))
 
 
 def _always(query: Query) -> str | None:
     return None
+
+
+def _needs_few_samples(query: Query) -> str | None:
+    try:
+        count = max((count for count, _ in spectrum_grids(query)), default=0)
+    except ValueError as error:  # samples that the user gave
+        return str(error)
+    return too_many(count) if count > MOST_SAMPLES else None
 
 
 def _needs_fine_points(query: Query) -> str | None:
@@ -199,11 +228,9 @@ def _needs_smooth_path(query: Query) -> str | None:
     return None
 
 
-def _geometric_error(query: Query) -> float:
-    """0.6 W^(-1/3) for W waves of path over the pupil (numerics note, section 5.5), and below one wave no agreement."""
-    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
-    waves = float(ray_displacement(query).max()) / d * a / 2 / float(query.wavelengths.max())
-    return 0.6 * waves ** (-1 / 3) if waves > 1 else 2.0
+def _geometric_estimate(query: Query) -> float:
+    """1.2 / (1 + phase / 3)^(1/3), phase the rms of the residual [rad]: the decay with waves of numerics note, 5.5."""
+    return max(1.2 / (1 + rays.phase / 3) ** (1 / 3) for rays in trace(query))
 
 
 def _rows() -> dict[tuple[str, str], Propagator]:
@@ -215,7 +242,7 @@ def _rows() -> dict[tuple[str, str], Propagator]:
                     physics,
                     method,
                     function=_grid_function(method),
-                    error=_grid_error,
+                    error=_grid_estimate(method),
                     cost=cost,
                     valid=_needs_fine_points if method == "fft" else _always,
                     paraxial=paraxial,
@@ -226,7 +253,7 @@ def _rows() -> dict[tuple[str, str], Propagator]:
                 physics,
                 "radial",
                 function=radial_psf,
-                error=lambda q: 1e-6 + _model_error(q),
+                error=_radial_estimate,
                 cost=_radial_cost,
                 valid=_needs_symmetry,
                 paraxial=paraxial,
@@ -237,9 +264,9 @@ def _rows() -> dict[tuple[str, str], Propagator]:
             "angular_spectrum",
             "fft",
             function=angular_spectrum_psf,
-            error=_spectrum_error,
-            cost=_fft_cost,
-            valid=_always,
+            error=_spectrum_estimate,
+            cost=_spectrum_cost,
+            valid=_needs_few_samples,
         )
     )
     rows.append(
@@ -247,7 +274,7 @@ def _rows() -> dict[tuple[str, str], Propagator]:
             "geometric",
             "rays",
             function=geometric_psf,
-            error=_geometric_error,
+            error=_geometric_estimate,
             cost=_radial_cost,
             valid=_needs_smooth_path,
             exact=False,
@@ -258,7 +285,7 @@ def _rows() -> dict[tuple[str, str], Propagator]:
             "reference",
             "quadrature",
             function=reference_psf,
-            error=lambda q: 1e-9 + _model_error(q) + _map_error(q),
+            error=lambda q: PIXELS_LIMIT if q.lens.has_pixels else SMOOTH_LIMIT,
             cost=lambda q: 1e3 * _matrix_cost(q),
             valid=_always,
         )
@@ -277,11 +304,13 @@ PROPAGATORS = _rows()
 PHYSICS = tuple(dict.fromkeys(physics for physics, _ in PROPAGATORS))
 
 
-def choose(query: Query, *, propagator: str = "nonparaxial", method: str | None = None) -> Propagator:
-    """The row that answers a query: the method named, or the cheapest exact one that is valid.
+def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method: str | None = None) -> Propagator:
+    """The row that answers a query: the method named, or the cheapest exact one that is valid; a row is itself.
 
     Raises: ValueError for an unknown propagator or method, listing the known ones.
     """
+    if isinstance(propagator, Propagator):
+        return propagator
     if propagator not in PHYSICS:
         raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
     rows = [row for (physics, _), row in PROPAGATORS.items() if physics == propagator]

@@ -274,7 +274,7 @@ def _grid_group(
     if method == "fft":
         scale_step = float(scales[0].detach()) * slope * step
         extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]])) / step
-        count, length, spacing = _fft_grid(scale_step, shortest=max(math.ceil(extent), 2 * reach + 1))
+        count, length, spacing = fft_grid(scale_step, shortest=max(math.ceil(extent), 2 * reach + 1))
     nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
 
     cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
@@ -318,12 +318,13 @@ def _curve(
     strengths = [float(scale) * max(reach, 1) * step for scale in scales.detach()]
     # at the corner of window and pupil; a PSF sees a hundredth of it, a gradient to the geometry has one power less
     error = 1e-8 if query.dtype == torch.float64 else 1e-4
-    orders = [Curvature.order_for(strength, tau=tau, error=error) for strength in strengths]
+    corner = 1.0 if query.lens.round else math.sqrt(2)
+    orders = [Curvature.order_for(strength, tau=tau, error=error, corner=corner) for strength in strengths]
     shared = Curvature.build(kernels[0], nodes, tau=tau, step=step, reach=reach, order=max(orders), like=like)
     return [CurvedTransform(*parts) for parts in zip(kernels, itertools.repeat(shared), strengths, orders)]
 
 
-def _fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:
+def fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:
     """(pupil samples, length, spacing) of the FFT whose bins fall on the points: spacing = 2 pi / (length * s *
     step).
     """

@@ -21,7 +21,7 @@ from torch import Tensor
 
 EDGE_MARGIN = 12  # samples of the grid beyond the rim, where low-passed edges still differ from zero
 _EDGE_HALF_WIDTH = 6  # samples; half width of the low-pass for edge weights
-_FINE = 5  # cells per sample in which the area of the rim is measured exactly
+FINE = 5  # cells per sample in which the area of the rim is measured exactly
 _SLAB_COLUMNS = 32  # of a banded matrix: narrow enough to leave out most zeros, wide enough for a matrix product
 _MAP_HALF_WIDTH = 12  # samples; half width of the low-pass that brings a pixel map onto the pupil grid
 _MAP_BETA = 7.9  # 80 dB: passes 0.79 of the Nyquist frequency and stops from 1.21; kappa 2.5 needs 0.8 and 1.2
@@ -132,6 +132,29 @@ def square_coverage(cells: int, *, half_width: float) -> Tensor:
     return share[:, None] * share
 
 
+@functools.lru_cache(maxsize=1)
+def _edge_taps() -> np.ndarray:
+    """The low-pass of edge weights, a tap for each fine cell; the outer taps undo the droop of the cell average."""
+    reach = _EDGE_HALF_WIDTH * FINE
+    taps = _kaiser_sinc(np.arange(-reach, reach + 1) / FINE, half_width=_EDGE_HALF_WIDTH, beta=13.2)
+    taps = np.convolve(taps, [-1 / 24, 13 / 12, -1 / 24])
+    return taps / taps.sum()
+
+
+@functools.lru_cache(maxsize=1)
+def _edge_spectrum() -> tuple[np.ndarray, np.ndarray]:
+    frequency = np.linspace(0, 1.5, 1501)
+    taps = _edge_taps()
+    offset = (np.arange(taps.size) - taps.size // 2) / FINE
+    response = (taps * np.cos(2 * np.pi * frequency[:, None] * offset)).sum(1) * np.sinc(frequency / FINE)
+    return frequency, response
+
+
+def edge_response(frequency: np.ndarray) -> np.ndarray:
+    """What edge weights leave of the light that a rim diffracts, at a frequency in cycles per sample, >= 0."""
+    return np.interp(frequency, *_edge_spectrum(), right=0.0)
+
+
 @functools.lru_cache(maxsize=64)
 def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     """Quadrature weights of a disc on one quadrant of a grid: high order, although the rim cuts through cells.
@@ -146,21 +169,19 @@ def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     if radius <= 0:
         return torch.zeros(count // 2, count // 2, dtype=torch.float64)
     half = count // 2
-    reach = _EDGE_HALF_WIDTH * _FINE
-    cells = half * _FINE + reach + 1
-    edges = np.arange(cells + 1) * (spacing / _FINE / radius)
+    reach = _EDGE_HALF_WIDTH * FINE
+    cells = half * FINE + reach + 1
+    edges = np.arange(cells + 1) * (spacing / FINE / radius)
     area = _disc_area_below(edges[:, None], edges[None, :])
-    coverage = np.diff(np.diff(area, axis=0), axis=1) / (spacing / _FINE / radius) ** 2
-    taps = _kaiser_sinc(np.arange(-reach, reach + 1) / _FINE, half_width=_EDGE_HALF_WIDTH, beta=13.2)
-    taps = np.convolve(taps, [-1 / 24, 13 / 12, -1 / 24])  # undoes the droop of the cell average
-    kernel = torch.as_tensor(taps / taps.sum())
+    coverage = np.diff(np.diff(area, axis=0), axis=1) / (spacing / FINE / radius) ** 2
+    kernel = torch.as_tensor(_edge_taps())
 
     quadrant = torch.as_tensor(coverage)
     for _ in range(2):  # rows, then (transposed) columns; mirrored about the axis for the taps that reach across it
         mirrored = torch.cat([quadrant[:, : reach + 1].flip(1), quadrant], dim=1)
-        start = (_FINE - 1) // 2  # node j sits at the centre of cell 5 j + 2
-        signal = mirrored[:, start : start + (half - 1) * _FINE + kernel.numel()]
-        quadrant = torch.nn.functional.conv1d(signal[:, None], kernel[None, None], stride=_FINE)[:, 0].T
+        start = (FINE - 1) // 2  # node j sits at the centre of cell 5 j + 2
+        signal = mirrored[:, start : start + (half - 1) * FINE + kernel.numel()]
+        quadrant = torch.nn.functional.conv1d(signal[:, None], kernel[None, None], stride=FINE)[:, 0].T
     return quadrant.contiguous()
 
 
@@ -187,6 +208,19 @@ def _low_pass_integral() -> tuple[np.ndarray, np.ndarray]:
     # Simpson-like correction of the trapezium: h^2/12 times the slope at the ends vanishes, the kernel is 0 there
     integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)]) * step
     return offset, integral / integral[-1]
+
+
+@functools.lru_cache(maxsize=1)
+def _map_spectrum() -> tuple[np.ndarray, np.ndarray]:
+    offset = np.linspace(-_MAP_HALF_WIDTH, _MAP_HALF_WIDTH, 20 * 2 * _MAP_HALF_WIDTH + 1)
+    kernel = _kaiser_sinc(offset, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
+    frequency = np.linspace(0, 1.5, 601)
+    return frequency, (kernel * np.cos(2 * np.pi * frequency[:, None] * offset)).sum(1) / kernel.sum()
+
+
+def map_response(frequency: np.ndarray) -> np.ndarray:
+    """What the low-pass of pixel maps leaves of a frequency in cycles per sample, >= 0."""
+    return np.interp(frequency, *_map_spectrum(), right=0.0)
 
 
 def pixel_weights(edges: Tensor, nodes: Tensor, *, spacing: float) -> Tensor:

@@ -256,7 +256,7 @@ class FFTTransform(_PlainLayout):
 
 
 def mean_slope(tau: float) -> float:
-    """What of 1 / q = 1 / sqrt(1 + tau rho^2) is split off as its mean: leaves the least max |rho delta| over the disc.
+    """What of 1 / q = 1 / sqrt(1 + tau rho^2) is split off as its mean: leaves the least max |rho delta|, rho <= 1.
 
     Near tau / 8 for small tau, where 1 / q - 1 itself reaches tau / 2.
     """
@@ -275,9 +275,12 @@ class Curvature:
     extent: float
 
     @staticmethod
-    def order_for(strength: float, *, tau: float, error: float) -> int:
-        """The highest power p + r that leaves `error` at the corner of window and pupil; strength: scale * extent."""
-        rho = torch.linspace(0, 1, 33, dtype=torch.float64)
+    def order_for(strength: float, *, tau: float, error: float, corner: float) -> int:
+        """The highest power p + r that leaves `error` at the corner of window and pupil.
+
+        strength: scale * extent. corner: largest rho, 1 in a round pupil and sqrt 2 in a square one.
+        """
+        rho = torch.linspace(0, corner, 33, dtype=torch.float64)
         delta = torch.rsqrt(1 + tau * rho**2) - mean_slope(tau)
         phase = math.sqrt(2) * strength * float((rho * delta).abs().max())
         order, remainder = 0, phase

@@ -58,7 +58,8 @@ def stated_error(
     lens: optics.Lens, n: int, *, pitch: float = PITCH, distance: float = math.inf, propagator: str
 ) -> float:
     query = lens.query([WAVELENGTH], distances=distance, pixel_pitch=pitch, shape=(n, n), integrate=False)
-    return choose(query, propagator=propagator).error(query)
+    row = choose(query, propagator=propagator)
+    return 3 * row.error(query) + row.model_error(query)
 
 
 def airy(points: np.ndarray) -> np.ndarray:

@@ -48,6 +48,11 @@ def l1(psf: torch.Tensor | np.ndarray, truth: torch.Tensor | np.ndarray) -> floa
     return float((psf - truth).abs().sum() / truth.abs().sum())
 
 
+def stated(row: Propagator, asked: Query) -> float:
+    """What may separate a row from Rayleigh-Sommerfeld: three times its estimate, as promised, and the model's own."""
+    return 3 * row.error(asked) + row.model_error(asked)
+
+
 # ---- the table ---------------------------------------------------------------------------------------------------
 
 
@@ -118,10 +123,10 @@ def test_the_stated_error_holds_against_rayleigh_sommerfeld(
     if row.physics == "angular_spectrum" and (case in ("focus", "defocus") or (case == "singlet" and integrate)):
         pytest.skip("1 s each: they run with the slow tests")
     asked = query(make(), distance=distance, integrate=integrate)
-    error, stated = l1(row(asked)[0, 0], truths[case][integrate]), row.error(asked)
-    print(f"{row.physics}/{row.method} {case} {'pixels' if integrate else 'points'}: {error:.1e}, stated {stated:.1e}")
-    assert error <= stated
-    assert stated <= 2  # no error of two non-negative images of the same energy is larger
+    error, allowed = l1(row(asked)[0, 0], truths[case][integrate]), stated(row, asked)
+    print(f"{row.physics}/{row.method} {case} {'pixels' if integrate else 'points'}: {error:.1e}, stated {allowed:.1e}")
+    assert error <= allowed
+    assert row.error(asked) <= 2  # no error of two non-negative images of the same energy is larger
 
 
 @pytest.mark.slow
@@ -131,7 +136,7 @@ def test_the_stated_error_holds_for_the_angular_spectrum(case: str, integrate: b
     make, distance, _ = CASES[case]
     row = PROPAGATORS["angular_spectrum", "fft"]
     asked = query(make(), distance=distance, integrate=integrate)
-    assert l1(row(asked)[0, 0], truths[case][integrate]) <= row.error(asked)
+    assert l1(row(asked)[0, 0], truths[case][integrate]) <= stated(row, asked)
 
 
 @pytest.mark.slow
@@ -156,9 +161,9 @@ def test_the_stated_error_holds_in_the_large_window(row: Propagator) -> None:
         spacing=WAVELENGTH * 50 * mm / (16 * 2.5 * mm),
     )
     truth = intensity(np.stack([r, 0 * r], axis=-1)) * PITCH**2
-    error, stated = l1(row(asked)[0, 0], truth), row.error(asked)
-    print(f"{row.physics} 297 x 297 in focus: {error:.1e}, stated {stated:.1e}")
-    assert error <= stated
+    error, allowed = l1(row(asked)[0, 0], truth), stated(row, asked)
+    print(f"{row.physics} 297 x 297 in focus: {error:.1e}, stated {allowed:.1e}")
+    assert error <= allowed
 
 
 @pytest.mark.parametrize("row", GRID_ROWS)
@@ -166,14 +171,14 @@ def test_the_error_falls_as_the_sampling_tightens(row: Propagator) -> None:
     lens = singlet()
     asked = {"distance": 1.0, "dtype": torch.float64, "integrate": False}
     truth = PROPAGATORS[row.physics, "radial"](query(lens, 129, **asked))
-    errors, stated = [], []
+    errors, estimates = [], []
     for samples in (96, 128, 192, 288):
         at = query(lens, 129, samples=samples, **asked)
         errors.append(l1(row(at), truth))
-        stated.append(row.error_of(at))
+        estimates.append(row.error_of(at))  # without what the paraxial model costs
     print(f"{row.physics}/{row.method}:", *(f"{error:.1e}" for error in errors))
-    assert all(later < sooner for sooner, later in itertools.pairwise(stated))
-    assert all(error <= allowed for error, allowed in zip(errors, stated, strict=True))
+    assert all(later <= sooner for sooner, later in itertools.pairwise(estimates))
+    assert all(error <= 3 * estimate for error, estimate in zip(errors, estimates, strict=True))
     if row.method != "fft":  # which scales its own grid to the pixels
         # measured: one order for each third more samples, high-order edge weights
         assert errors[-1] < errors[0] / 50
@@ -188,8 +193,8 @@ def test_energy_is_that_of_the_window(row: Propagator) -> None:
     asked = query(small_lens(), 65)
     psf = row(asked)[0, 0].detach()
     truth = PROPAGATORS["nonparaxial", "radial"](asked)[0, 0]
-    assert float(psf.sum()) <= 1 + row.error(asked)
-    assert float(psf.sum()) == pytest.approx(float(truth.sum()), abs=row.error(asked))
+    assert float(psf.sum()) <= 1 + stated(row, asked)
+    assert float(psf.sum()) == pytest.approx(float(truth.sum()), abs=stated(row, asked))
     assert float(psf.min()) >= -1e-6  # a sinc filter of a truncated image may dip below 0 by its sampling error
     assert float(psf.sum()) > 0.9
 
@@ -219,7 +224,7 @@ def test_precision(row: Propagator) -> None:
 def test_each_distance_and_wavelength_alone(row: Propagator) -> None:
     lens = small_lens()
     wavelengths, distances = (650 * nm, 450 * nm), (math.inf, 0.6)
-    samples = 128 if row.method in ("matrix", "chirp_z", "fft") else None
+    samples = 128 if row.on_grid else None
     batch = row(
         query(lens, 21, distance=list(distances), wavelengths=wavelengths, dtype=torch.float64, samples=samples)
     )
@@ -229,7 +234,7 @@ def test_each_distance_and_wavelength_alone(row: Propagator) -> None:
                 query(lens, 21, distance=distance, wavelengths=[wavelength], dtype=torch.float64, samples=samples)
             )[0, 0]
             # grids are sized for the batch: the difference is a sampling error, below the stated one
-            assert l1(batch[z, band], alone) <= min(0.1, row.error(query(lens, 21, distance=distance)))
+            assert l1(batch[z, band], alone) <= min(0.1, stated(row, query(lens, 21, distance=distance)))
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -291,7 +296,7 @@ def test_rays_refuse_a_doe_of_flat_pixels() -> None:
 
 def test_the_angular_spectrum_refuses_what_it_cannot_sample() -> None:
     lens = optics.Lens(optics.CircularAperture(20 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
-    with pytest.raises(ValueError, match=r"angular_spectrum needs a grid of \d+ at 550 nm .* use propagator='nonpar"):
+    with pytest.raises(ValueError, match=r"angular_spectrum/fft needs a grid of \d+ .* use propagator='nonpar"):
         PROPAGATORS["angular_spectrum", "fft"](query(lens, 21))
 
 

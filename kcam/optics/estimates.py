@@ -1,0 +1,141 @@
+"""What a PSF is expected to be wrong by, before it is computed: L1 against the `reference` row of the same query.
+
+On a Cartesian grid nothing but the rim is approximated (its edge weights are low-passed), so the estimate follows the
+light that the rim diffracts: how much of it reaches each part of the window, and what the low-pass takes from it or
+folds back. The rest are fits; `tests/optics/test_estimates.py` holds all of them to random cameras.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from kcam.optics.psf import Query, residual_path
+from kcam.optics.pupil import FINE, edge_response, from_image_side, map_response
+
+_SIDE = 65  # of the grid on which rays are traced
+_RADII = 96  # of the window over which errors are summed
+_QUANTILES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.0)  # of the rim's displacements
+ROUNDING = {torch.float32: 1e-6, torch.float64: 1e-12}
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Where the smooth part of a pupil sends its light, for one wavelength and distance (1 / vergence); in metres.
+
+    rms: of the displacement over the pupil; rim: quantiles of it along the rim. phase: rms of the residual [rad];
+    beyond: rms of what the paraxial model leaves out of it [rad].
+    """
+
+    wavelength: float
+    vergence: float
+    rms: float
+    rim: np.ndarray
+    phase: float
+    beyond: float
+
+
+def trace(query: Query) -> list[Rays]:
+    """Rays at the shortest and longest wavelength, for the outermost distances and that in best focus."""
+    with torch.no_grad():
+        wavelengths = torch.stack([query.wavelengths.min(), query.wavelengths.max()]).unique()
+        vergences = query.vergences.detach()
+        power = float(query.lens.power(wavelengths).mean()) - 1 / float(query.sensor_distance)
+        nearest = vergences[(vergences - power).abs().argmin()]
+        vergences = torch.stack([vergences.min(), vergences.max(), nearest]).unique()
+        side = torch.linspace(-1, 1, _SIDE, dtype=torch.float64, device=query.device)
+        exact = replace(query, wavelengths=wavelengths, vergences=vergences, paraxial=False)
+        x, y = side[None, :], side[:, None]
+        tau = exact.tau
+        coefficients, maps = residual_path(exact, exact.pupil(*from_image_side(x, y, tau)))
+        paths = torch.einsum("lzt,tvu->lzvu", coefficients, maps)
+        flat = replace(exact, paraxial=True)
+        coefficients, maps = residual_path(flat, flat.pupil(x, y))
+        beyond = paths - torch.einsum("lzt,tvu->lzvu", coefficients, maps)
+
+        rho2 = x**2 + y**2
+        open_part = rho2 <= 1.0001 if query.lens.round else torch.ones_like(rho2, dtype=torch.bool)
+        rim = open_part & (rho2 > 0.8 if query.lens.round else torch.maximum(x.abs(), y.abs()) > 0.9)
+        step = float(side[1] - side[0]) * float(query.semi_aperture)
+        d = float(query.sensor_distance)
+        found = []
+        for index, wavelength in enumerate(wavelengths.tolist()):
+            wavenumber = 2 * math.pi / wavelength
+            for vergence, path, rest in zip(vergences.tolist(), paths[index], beyond[index], strict=True):
+                slopes = torch.gradient(path, spacing=step)
+                displacement = d * torch.hypot(*slopes)
+                rms = float(displacement[open_part].square().mean().sqrt())
+                quantiles = np.quantile(displacement[rim].cpu().numpy(), _QUANTILES)
+                phase, left_out = (wavenumber * float(part[open_part].std()) for part in (path, rest))
+                found.append(Rays(wavelength, vergence, rms, quantiles, phase, left_out))
+        return found
+
+
+def grid_error(query: Query, rays: Rays, *, period: float) -> float:
+    """What a Cartesian grid costs: its edge weights, and its maps of flat pixels, relative to the light in the window.
+
+    The rim sends light to a distance Delta from where its ray lands, of the irradiance lambda N / (2 pi^3 Delta^2 r) on
+    each side of the axis (the envelope of the Airy pattern, for a pupil in focus). Edge weights pass H(Delta / period)
+    of its amplitude and fold in what they should stop one period away; the cells in which they measure the rim's area
+    fold in a little from FINE periods away.
+
+    Args: period: at which the transform repeats, lambda d / spacing [m].
+    """
+    airy = rays.wavelength * float(query.sensor_distance.detach()) / (2 * float(query.semi_aperture.detach()))
+    edge = query.pixel_pitch * (max(query.shape) / 2 + (1 if query.integrate else 0))
+    r = (np.arange(_RADII) + 0.5) / _RADII * edge
+    blur = max(math.sqrt(2) * rays.rms, airy / 2)
+    light = np.where(r < blur, 1 / (math.pi * blur**2), 0.0)
+    losses = []
+    for side in (1, -1):
+        landed = side * rays.rim[:, None]
+        here = np.abs(r - landed)
+        from_rim = _from_rim(here, r, airy)
+        light = light + from_rim.mean(0)
+        loss = from_rim * (1 - edge_response(here / period)) ** 2
+        for repeat, response in ((period, edge_response), (FINE * period, _cell_response)):
+            folded = np.abs(repeat - r + landed)
+            loss = loss + 4 * _from_rim(folded, np.abs(repeat - r), airy) * response(folded / period) ** 2
+        losses.append(np.sqrt(loss.mean(0)))
+    wrong = sum(2 * np.sqrt(light) * loss + loss**2 for loss in losses)
+    captured = min(1.0, float((light * r).sum()) * 2 * math.pi * edge / _RADII)
+    return float((wrong * r).sum() / (light * r).sum()) + _map_error(query, period=period, captured=captured)
+
+
+def _cell_response(frequency: np.ndarray) -> np.ndarray:
+    """What the area of a cell, 1 / FINE samples wide, leaves of a frequency in cycles per sample."""
+    return np.sinc(frequency / FINE)
+
+
+def _from_rim(distance: np.ndarray, r: np.ndarray, airy: float) -> np.ndarray:
+    """Irradiance of one side of the rim, averaged over its fringes and finite where the ray itself lands."""
+    return airy / (2 * math.pi**3) / ((distance**2 + airy**2 / 4) * (r + airy / 2))
+
+
+def _map_error(query: Query, *, period: float, captured: float) -> float:
+    """What maps of flat pixels cost: the rim cuts their pixels in cells of a finite size, and their low-pass droops.
+
+    The first is of all the light, and weighs more where little is captured (a fit). The droop is averaged over a window
+    that the light fills, and weighted by 0.3, for most light falls short of that.
+    """
+    if not query.lens.has_pixels:
+        return 0.0
+    r = (np.arange(_RADII) + 0.5) / _RADII
+    frequency = r * query.half_window / period
+    droop = np.abs(1 - map_response(frequency) ** 2) + map_response(1 - frequency) ** 2
+    return 9e-4 / captured ** (1 / 3) + 0.3 * float((droop * r).sum() / r.sum())
+
+
+def jumps(query: Query) -> float:
+    """The rms step between neighbouring pixels of the phase maps, wrapped [rad]."""
+    total = 0.0
+    for element in query.lens.elements:
+        pixels = element.pixel_map(query.wavelengths)
+        if pixels is not None and pixels.factors is not None and pixels.values.shape[-1] > 1:
+            phase = pixels.values.detach().double() * float(pixels.factors.max())
+            steps = torch.cat([phase.diff(dim=dim).flatten() for dim in (0, 1)])
+            total += float((torch.remainder(steps + math.pi, 2 * math.pi) - math.pi).square().mean())
+    return math.sqrt(total)
