@@ -45,10 +45,12 @@ from kcam.optics.transforms import (
     mean_slope,
     pupil_intensity,
 )
+from kcam.optics.warp import Warp
 
 if TYPE_CHECKING:
     from kcam.optics.lens import Lens
 
+_GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
 _MOST_CELLS = 3072  # on which several maps are brought together exactly, beyond by the nearest pixel; and the rim
 
 
@@ -61,6 +63,8 @@ class Query:
     active: width of the light-sensitive part of a pixel (square root of the fill factor).
     samples: across the pupil, or None for the rule of `sampling.pupil_samples` with `kappa`.
     cells_per_sample: of pixel maps, at least, for each pupil sample and axis: the rim cuts cells by their area.
+    curved_kernel: beyond the paraxial range leave flat pixels in the true pupil plane and curve the kernel, exact and
+        slow, instead of interpolating their field into the plane where the kernel is straight.
     """
 
     lens: Lens
@@ -76,6 +80,7 @@ class Query:
     kappa: float = sampling.KAPPA
     samples: int | None = None
     cells_per_sample: float = 1.7
+    curved_kernel: bool = False
 
     @property
     def semi_aperture(self) -> Tensor:
@@ -254,7 +259,11 @@ def _groups(query: Query, displacement: Tensor, *, method: str) -> Iterator[tupl
         own_grid = index if method == "fft" else -1  # its pupil grid scales with the wavelength
         groups.setdefault((count, query.evaluation_grid(wavelength)[0], own_grid), []).append(index)
     for (count, per_pixel, _), members in groups.items():
-        yield members, count, per_pixel
+        points = 2 * math.ceil(per_pixel * query.half_pixels) + 1
+        each = 2 * count**2 + 3 * query.vergences.numel() * points**2  # numbers held for each wavelength
+        length = max(1, _GROUP_NUMBERS // each)
+        for first in range(0, len(members), length):
+            yield members[first : first + length], count, per_pixel
 
 
 def _grid_group(
@@ -262,7 +271,7 @@ def _grid_group(
 ) -> Tensor:
     wavelengths = query.wavelengths[members].to(query.device)
     wavenumbers = 2 * math.pi / wavelengths
-    curved = query.lens.has_pixels and not query.paraxial  # flat pixels are sampled in the true pupil plane
+    curved = query.curved_kernel and query.lens.has_pixels and not query.paraxial
     semi_aperture = query.semi_aperture if curved else query.image_side_semi_aperture
     slope = mean_slope(float(query.tau.detach())) if curved else 1.0
     scales = wavenumbers * semi_aperture / query.sensor_distance
@@ -281,8 +290,8 @@ def _grid_group(
     x, y = nodes[None, :].to(query.device), nodes[:, None].to(query.device)
     pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
     coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
-    amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing)
-    field = None if cells is None else _PixelField.apply(cells.phases, cells.factors, cells.amplitude, cells.weights)
+    amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing, curved=curved)
+    field = None if cells is None else _pixel_field(query, cells, count=count, spacing=spacing, curved=curved)
 
     def straight(scale: float) -> Transform:
         if method == "fft":
@@ -316,10 +325,8 @@ def _curve(
     """The kernels of a group, curved as far as each needs it."""
     tau = float(query.tau.detach())
     strengths = [float(scale) * max(reach, 1) * step for scale in scales.detach()]
-    # at the corner of window and pupil; a PSF sees a hundredth of it, a gradient to the geometry has one power less
-    error = 1e-8 if query.dtype == torch.float64 else 1e-4
     corner = 1.0 if query.lens.round else math.sqrt(2)
-    orders = [Curvature.order_for(strength, tau=tau, error=error, corner=corner) for strength in strengths]
+    orders = [Curvature.order_for(strength, tau=tau, error=1e-8, corner=corner) for strength in strengths]
     shared = Curvature.build(kernels[0], nodes, tau=tau, step=step, reach=reach, order=max(orders), like=like)
     return [CurvedTransform(*parts) for parts in zip(kernels, itertools.repeat(shared), strengths, orders)]
 
@@ -338,7 +345,7 @@ def fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:
 
 
 def _amplitude(
-    query: Query, pupil: Pupil, cells: _Cells | None, *, count: int, spacing: float
+    query: Query, pupil: Pupil, cells: _Cells | None, *, count: int, spacing: float, curved: bool
 ) -> tuple[Tensor, Tensor]:
     """Quadrature weights times obliquity and source amplitude, (1 or Z, N, N), and the energy that passes (1 or Z,).
 
@@ -363,8 +370,8 @@ def _amplitude(
         r2 = pupil.rho2 * query.semi_aperture**2
         falloff = 1 / (1 + query.vergences[:, None, None] ** 2 * r2)
         # the Debye map's amplitude is `measure` in the image-side plane; d^2 u' / d^2 u is measure^-2
-        amplitude = amplitude * (pupil.measure if cells is None else 1 / pupil.measure) * torch.sqrt(falloff)
-        energy = energy * (pupil.measure**2 if cells is None else 1) * falloff
+        amplitude = amplitude * (1 / pupil.measure if curved else pupil.measure) * torch.sqrt(falloff)
+        energy = energy * (1 if curved else pupil.measure**2) * falloff
     return amplitude, energy.sum((-2, -1))
 
 
@@ -456,6 +463,37 @@ def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: flo
     with torch.no_grad():
         slope = (evaluate(float(tau) + step) - evaluate(float(tau) - step)) / (2 * step)
     return value + ((tau - tau.detach()) * slope).to(value)
+
+
+def _pixel_field(query: Query, cells: _Cells, *, count: int, spacing: float, curved: bool) -> Pair:
+    """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (L, N, N)."""
+    corner = 1.05 if query.lens.round else 1.05 * math.sqrt(2)
+
+    def both(tau: float) -> Tensor:
+        warp = None
+        if not (curved or query.paraxial):
+            warp = Warp.build(
+                count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device
+            )
+        onto = cells.weights if warp is None else _Warped(cells.weights, warp)
+        return torch.stack(_PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto))
+
+    re, im = _following(query.tau, both, spacing=spacing)
+    return re, im
+
+
+@dataclass(frozen=True)
+class _Warped:
+    """Cells onto the true plane's grid, and from there to the image-side plane."""
+
+    weights: MapWeights
+    warp: Warp
+
+    def forward(self, field: Tensor) -> Tensor:
+        return self.warp.forward(self.weights.forward(field))
+
+    def adjoint(self, grid: Tensor) -> Tensor:
+        return self.weights.adjoint(self.warp.adjoint(grid))
 
 
 class _PixelField(torch.autograd.Function):

@@ -12,7 +12,7 @@ edges would be curved there, are sampled in the true plane; `transforms.CurvedTr
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -208,6 +208,11 @@ def _low_pass_integral() -> tuple[np.ndarray, np.ndarray]:
     # Simpson-like correction of the trapezium: h^2/12 times the slope at the ends vanishes, the kernel is 0 there
     integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)]) * step
     return offset, integral / integral[-1]
+
+
+def map_kernel() -> tuple[float, Callable[[np.ndarray], np.ndarray]]:
+    """The low-pass of pixel maps: (half width in samples, its values at offsets in samples); 1 at 0."""
+    return _MAP_HALF_WIDTH, functools.partial(_kaiser_sinc, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
 
 
 @functools.lru_cache(maxsize=1)

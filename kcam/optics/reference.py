@@ -64,6 +64,7 @@ def _refined(query: Query) -> Query:
         dtype=torch.float64,
         kappa=max(query.kappa, _KAPPA),
         samples=None,
+        curved_kernel=True,
         cells_per_sample=max(query.cells_per_sample, _CELLS_PER_SAMPLE),
     )
 

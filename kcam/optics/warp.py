@@ -1,0 +1,108 @@
+"""From the true pupil plane, where a map's pixels are straight, to the image-side plane, where the kernel is.
+
+The field there is band-limited and its samples hardly move (by 0.19 tau semi-apertures at most), so they are
+interpolated along x, then along y, by the same windowed sinc that brought the map onto the grid. Its weights are a
+short Chebyshev series in the displacement: a few banded matrix products, the same for all wavelengths on one grid.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcam.optics.pupil import map_kernel
+
+_SLAB = 64  # columns: narrow enough to leave out most zeros, wide enough for a matrix product
+_SMALLEST = 3e-5  # coefficient of the series that is kept
+_MOST_TERMS = 64
+
+
+@dataclass(frozen=True)
+class Warp:
+    """Linear map (N, N) -> (N, N) by interpolation along rows, then along columns.
+
+    slabs: (band, terms * columns), one for each slab of columns, for both passes; starts: of the bands.
+    series: (N, terms, N) Chebyshev polynomials of the displacement, for each pass.
+    """
+
+    slabs: tuple[Tensor, ...]
+    starts: tuple[int, ...]
+    series: tuple[Tensor, Tensor]
+
+    @staticmethod
+    @functools.lru_cache(maxsize=4)
+    def build(
+        count: int, *, spacing: float, tau: float, corner: float, dtype: torch.dtype, device: torch.device
+    ) -> Warp | None:
+        """For pupil grids (N, N), both planes alike; None where nothing moves. corner: largest rho that matters."""
+        nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
+        x, y = nodes[None, :], nodes[:, None]
+        # along x at a true y, then along y at an image-side x: rho'^2 = rho^2 (1 + tau) / (1 + tau rho^2)
+        along_x = x * (torch.sqrt((1 + tau * y**2) / (1 + tau - tau * x**2).clamp(min=0.1)) - 1)
+        along_y = y * (torch.rsqrt((1 + tau * (1 - x**2 - y**2)).clamp(min=0.1)) - 1)
+        inside = x**2 + y**2 <= corner**2
+        limit = max(float((d.abs() * inside).max()) for d in (along_x, along_y)) / spacing
+        if limit < 1e-4:
+            return None
+        coefficients, reach = _series(limit)
+        terms = coefficients.shape[0]
+        slabs, starts = [], []
+        for first in range(0, count, _SLAB):
+            columns = torch.arange(first, min(first + _SLAB, count))
+            low, high = max(0, first - reach), min(count, int(columns[-1]) + reach + 1)
+            lag = columns[None, :] - torch.arange(low, high)[:, None]
+            inside_reach = lag.abs() <= reach
+            values = coefficients[:, (lag.clamp(-reach, reach) + reach)] * inside_reach  # (terms, band, columns)
+            slabs.append(values.permute(1, 0, 2).reshape(high - low, -1).to(device, dtype))
+            starts.append(low)
+        bases = []
+        for displacement in (along_x, along_y.T):
+            u = (displacement / spacing / limit).clamp(-1, 1)
+            powers = [torch.ones_like(u), u]
+            while len(powers) < terms:
+                powers.append(2 * u * powers[-1] - powers[-2])
+            bases.append(torch.stack(powers[:terms], dim=1).to(device, dtype))
+        return Warp(tuple(slabs), tuple(starts), (bases[0], bases[1]))
+
+    def forward(self, field: Tensor) -> Tensor:
+        """(N, N) in the true plane -> (N, N) in the image-side plane."""
+        return self._along(self._along(field, self.series[0]).T, self.series[1]).T
+
+    def adjoint(self, grid: Tensor) -> Tensor:
+        """The transpose of `forward`."""
+        return self._back(self._back(grid.T, self.series[1]).T, self.series[0])
+
+    def _along(self, field: Tensor, series: Tensor) -> Tensor:
+        out = torch.empty_like(series[:, 0])
+        at = 0
+        for slab, start in zip(self.slabs, self.starts, strict=True):
+            columns = slice(at, at + slab.shape[1] // series.shape[1])
+            product = (field[:, start : start + slab.shape[0]] @ slab).view(field.shape[0], series.shape[1], -1)
+            torch.sum(product.mul_(series[:, :, columns]), dim=1, out=out[:, columns])
+            at = columns.stop
+        return out
+
+    def _back(self, grid: Tensor, series: Tensor) -> Tensor:
+        field = torch.zeros_like(series[:, 0])
+        at = 0
+        for slab, start in zip(self.slabs, self.starts, strict=True):
+            columns = slice(at, at + slab.shape[1] // series.shape[1])
+            spread = (grid[:, None, columns] * series[:, :, columns]).reshape(grid.shape[0], -1)
+            field[:, start : start + slab.shape[0]].addmm_(spread, slab.T)
+            at = columns.stop
+        return field
+
+
+def _series(limit: float) -> tuple[Tensor, int]:
+    """Chebyshev coefficients (terms, 2 reach + 1) of the interpolation kernel h(lag + u * limit), |u| <= 1."""
+    half_width, kernel = map_kernel()
+    reach = int(np.ceil(half_width + limit))
+    nodes = np.cos(np.pi * (np.arange(2 * _MOST_TERMS) + 0.5) / (2 * _MOST_TERMS))
+    values = kernel(np.arange(-reach, reach + 1)[:, None] + limit * nodes)
+    fitted = np.polynomial.chebyshev.chebfit(nodes, values.T, _MOST_TERMS - 1)
+    kept = np.nonzero(np.abs(fitted).max(1) > _SMALLEST)[0]
+    return torch.as_tensor(fitted[: max(int(kept[-1]) + 1, 2)]), reach
