@@ -2,6 +2,7 @@
 
     python docs/generate.py               writes the tables, and what the code blocks print
     python docs/generate.py --pictures    renders the pictures too: a minute
+    python docs/generate.py --traps       runs the traps of tests/stability first: ten seconds
     python docs/generate.py --check       changes nothing; says what is out of step
 
 A table stands between ``<!-- generated: name -->`` and ``<!-- end -->``; what a ```python block prints stands in the
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import io
 import json
 import math
@@ -100,15 +102,74 @@ def propagators_table() -> str:
         how = METHODS[f"{row.physics}/{row.method}"]
         method = f"`{row.method}`" + (f": {how}" if how else "")
         lines.append(f"| {physics} | {method} | {' | '.join(cells)} | {row.cost(first) / cheapest:.0f} |")
+    model = " | ".join(scientific(default[name].model_error(query)) for name, query in queries.items())
+    lines.append(f"| *the reference itself, against Rayleigh-Sommerfeld* | | {model} | |")
     return "\n".join(lines)
 
 
 def scientific(value: float) -> str:
     """Two figures, as 3e-05 is easier to read: 0.0031, 3.1e-5."""
-    if value >= 1e-3:
+    if value >= 1e-3 or value == 0:
         return f"{value:.2g}"
     mantissa, exponent = f"{value:.1e}".split("e")
     return f"{mantissa}e{int(exponent)}"
+
+
+# ---- the traps -------------------------------------------------------------------------------------------------------
+
+TRAPS = RESULTS / "traps.json"
+PEERS = {"torchoptics": "TorchOptics", "prysm": "prysm", "hcipy": "hcipy"}
+AT_PEERS = {
+    "a piston": "k z = 1e7",
+    "object at infinity": "point source at infinity",
+    "pupil sampled too coarsely": "object at 5 cm",
+    "PSF smaller than a pixel": "PSF under one pixel",
+}
+"""Our trap -> the hard case of peers.json that shows it."""
+
+
+def measure_traps() -> None:
+    """Run every trap of tests/stability/traps.py and write what came out."""
+    sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "stability")]
+    import traps
+
+    rows = [dataclasses.asdict(row) for row in traps.rows()]
+    for row in rows:
+        row["naive"] = None if math.isnan(row["naive"]) else float(f"{row['naive']:.2g}")
+        row["kcam"] = row["kcam"] if isinstance(row["kcam"], str) else float(f"{row['kcam']:.2g}")
+    TRAPS.write_text(json.dumps({"torch": torch.__version__, "traps": rows}, indent=1) + "\n")
+
+
+def traps_table() -> str:
+    """Each trap as it is usually written and through kcam, in float32, and what other libraries do on the same case."""
+    cases = json.loads((RESULTS / "peers.json").read_text())["hard_cases"]
+    lines = [
+        "| case | usually written as | measured | usual float32 | kcam float32 | others |",
+        "|---|---|---|---:|---:|---|",
+    ]
+    for row in json.loads(TRAPS.read_text())["traps"]:
+        naive = "**NaN**" if row["naive"] is None else scientific(row["naive"])
+        ours = "a clear error" if isinstance(row["kcam"], str) else scientific(row["kcam"])
+        usual = row["usual"].replace("|", "\\|")
+        lines.append(
+            f"| {row['case']} | `{usual}` | {row['measure']} | {naive} | {ours} | {at_peers(row['case'], cases)} |"
+        )
+    return "\n".join(lines)
+
+
+def at_peers(trap: str, cases: list[dict[str, Any]]) -> str:
+    """What TorchOptics, prysm and hcipy gave, in float32 where they have it; empty where the case was not run there."""
+    found = []
+    for library, name in PEERS.items():
+        own = [c for c in cases if c["case"] == AT_PEERS.get(trap) and c["library"] == library]
+        single = [c for c in own if c["dtype"] == "float32"] or own
+        for case in single[:1]:
+            if case["outcome"] == "finite":
+                energy = f", energy {figures(case['energy'])}" if case["energy"] else ""
+                found.append(f"{name} L1 {scientific(case['l1'])}{energy}")
+            else:
+                found.append(f"{name} {'**NaN**' if case['outcome'] == 'NaN' else 'an error'}")
+    return "; ".join(found)
 
 
 # ---- the benchmarks --------------------------------------------------------------------------------------------------
@@ -116,7 +177,7 @@ def scientific(value: float) -> str:
 
 def benchmarks_table() -> str:
     """Every default of kcam against the baseline of its race, from benchmarks/results/*.json: losses are bold."""
-    files = sorted(RESULTS.glob("*.json"))
+    files = [path for path in sorted(RESULTS.glob("*.json")) if path != TRAPS]
     parts = [benchmark_part(json.loads(path.read_text()), path) for path in files]
     return "\n\n".join(part for part in parts if part) or "*Not measured yet: `make bench` writes the results.*"
 
@@ -192,7 +253,11 @@ def figures(value: float) -> str:
     return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
-TABLES: dict[str, Callable[[], str]] = {"propagators": propagators_table, "benchmarks": benchmarks_table}
+TABLES: dict[str, Callable[[], str]] = {
+    "propagators": propagators_table,
+    "traps": traps_table,
+    "benchmarks": benchmarks_table,
+}
 
 # ---- the README ------------------------------------------------------------------------------------------------------
 
@@ -336,8 +401,11 @@ def main(arguments: list[str] | None = None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pictures", action="store_true", help="render the pictures too")
+    parser.add_argument("--traps", action="store_true", help="measure the traps again")
     parser.add_argument("--check", action="store_true", help="change nothing; exit with 1 if something is out of step")
     options = parser.parse_args(arguments)
+    if options.traps:
+        measure_traps()
     before = README.read_text()
     with tempfile.TemporaryDirectory() as folder, inside(folder):
         after = with_output(with_tables(before))
