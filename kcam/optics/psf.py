@@ -214,8 +214,10 @@ def samples_by_rule(query: Query, *, displacement: float, wavelength: float) -> 
     """Pupil samples by the rule of `sampling.pupil_samples`, however many."""
     geometry = _geometry(query, displacement=displacement, wavelength=wavelength)
     needed = sampling.pupil_samples(**geometry, kappa=query.kappa)
-    # with a map few distinct grids: each needs weights of its own
-    return 64 * math.ceil(needed / 64) if query.lens.has_pixel_phase else needed
+    if query.lens.has_pixel_phase:  # few distinct grids: each needs weights of its own for the map
+        step = max(64, 2 ** (needed.bit_length() - 4))
+        needed = step * math.ceil(needed / step)
+    return needed
 
 
 def _geometry(query: Query, *, displacement: float, wavelength: float) -> dict[str, float]:

@@ -8,6 +8,7 @@ short Chebyshev series in the displacement: a few banded matrix products, the sa
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +27,13 @@ class Warp:
     """Linear map (N, N) -> (N, N) by interpolation along rows, then along columns.
 
     slabs: (band, terms * columns), one for each slab of columns, for both passes; starts: of the bands.
-    series: (N, terms, N) Chebyshev polynomials of the displacement, for each pass.
+    displacements: (N, N) in units of the largest, in which the series are Chebyshev's, for each pass.
     """
 
     slabs: tuple[Tensor, ...]
     starts: tuple[int, ...]
-    series: tuple[Tensor, Tensor]
+    terms: int
+    displacements: tuple[Tensor, Tensor]
 
     @staticmethod
     @functools.lru_cache(maxsize=4)
@@ -59,42 +61,54 @@ class Warp:
             values = coefficients[:, (lag.clamp(-reach, reach) + reach)] * inside_reach  # (terms, band, columns)
             slabs.append(values.permute(1, 0, 2).reshape(high - low, -1).to(device, dtype))
             starts.append(low)
-        bases = []
-        for displacement in (along_x, along_y.T):
-            u = (displacement / spacing / limit).clamp(-1, 1)
-            powers = [torch.ones_like(u), u]
-            while len(powers) < terms:
-                powers.append(2 * u * powers[-1] - powers[-2])
-            bases.append(torch.stack(powers[:terms], dim=1).to(device, dtype))
-        return Warp(tuple(slabs), tuple(starts), (bases[0], bases[1]))
+        displacements = [
+            (d / (spacing * limit)).clamp_(-1, 1).to(device, dtype).contiguous() for d in (along_x, along_y.T)
+        ]
+        return Warp(tuple(slabs), tuple(starts), terms, (displacements[0], displacements[1]))
 
     def forward(self, field: Tensor) -> Tensor:
         """(N, N) in the true plane -> (N, N) in the image-side plane."""
-        return self._along(self._along(field, self.series[0]).T, self.series[1]).T
+        return self._along(self._along(field, self.displacements[0]).T, self.displacements[1]).T
 
     def adjoint(self, grid: Tensor) -> Tensor:
         """The transpose of `forward`."""
-        return self._back(self._back(grid.T, self.series[1]).T, self.series[0])
+        return self._back(self._back(grid.T, self.displacements[1]).T, self.displacements[0])
 
-    def _along(self, field: Tensor, series: Tensor) -> Tensor:
-        out = torch.empty_like(series[:, 0])
-        at = 0
-        for slab, start in zip(self.slabs, self.starts, strict=True):
-            columns = slice(at, at + slab.shape[1] // series.shape[1])
-            product = (field[:, start : start + slab.shape[0]] @ slab).view(field.shape[0], series.shape[1], -1)
-            torch.sum(product.mul_(series[:, :, columns]), dim=1, out=out[:, columns])
-            at = columns.stop
+    def _along(self, field: Tensor, displacement: Tensor) -> Tensor:
+        out = torch.empty_like(displacement)
+        for slab, source, target in self._pieces():
+            terms = (field[:, source] @ slab).view(field.shape[0], self.terms, -1)
+            result = terms[:, 0]
+            for term, polynomial in zip(terms[:, 1:].unbind(1), _chebyshev(displacement[:, target]), strict=False):
+                result.addcmul_(term, polynomial)
+            out[:, target] = result
         return out
 
-    def _back(self, grid: Tensor, series: Tensor) -> Tensor:
-        field = torch.zeros_like(series[:, 0])
+    def _back(self, grid: Tensor, displacement: Tensor) -> Tensor:
+        field = torch.zeros_like(displacement)
+        for slab, source, target in self._pieces():
+            terms = slab.new_empty(grid.shape[0], self.terms, slab.shape[1] // self.terms)
+            terms[:, 0] = part = grid[:, target]
+            for term, polynomial in zip(terms[:, 1:].unbind(1), _chebyshev(displacement[:, target]), strict=False):
+                torch.mul(part, polynomial, out=term)
+            field[:, source].addmm_(terms.flatten(1), slab.T)
+        return field
+
+    def _pieces(self) -> Iterator[tuple[Tensor, slice, slice]]:
+        """(slab, its inputs, its outputs)."""
         at = 0
         for slab, start in zip(self.slabs, self.starts, strict=True):
-            columns = slice(at, at + slab.shape[1] // series.shape[1])
-            spread = (grid[:, None, columns] * series[:, :, columns]).reshape(grid.shape[0], -1)
-            field[:, start : start + slab.shape[0]].addmm_(spread, slab.T)
-            at = columns.stop
-        return field
+            columns = slab.shape[1] // self.terms
+            yield slab, slice(start, start + slab.shape[0]), slice(at, at + columns)
+            at += columns
+
+
+def _chebyshev(u: Tensor) -> Iterator[Tensor]:
+    """T1(u), T2(u), ... without end."""
+    before, now = torch.ones_like(u), u.clone()
+    while True:
+        yield now
+        before, now = now, (2 * u * now).sub_(before)
 
 
 def _series(limit: float) -> tuple[Tensor, int]:
