@@ -306,6 +306,8 @@ PHYSICS = tuple(dict.fromkeys(physics for physics, _ in PROPAGATORS))
 def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method: str | None = None) -> Propagator:
     """The row that answers a query: the method named, or the cheapest exact one that is valid; a row is itself.
 
+    With `samples` given, the cheapest that has a grid of so many.
+
     Raises: ValueError for an unknown propagator or method, listing the known ones.
     """
     if isinstance(propagator, Propagator):
@@ -318,5 +320,7 @@ def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method
             if row.method == method:
                 return row
         raise ValueError(f"{propagator} has no method {method!r}; known: {', '.join(row.method for row in rows)}.")
+    if query.samples is not None:  # a number of samples asks for a grid that has one
+        rows = [row for row in rows if row.on_grid] or rows
     valid = [row for row in rows if row.valid_for(query) is None] or rows
     return valid[0] if len(valid) == 1 else min(valid, key=lambda row: row.cost(query))

@@ -303,6 +303,13 @@ def test_the_angular_spectrum_refuses_what_it_cannot_sample() -> None:
 # ---- the choice --------------------------------------------------------------------------------------------------
 
 
+def test_samples_ask_for_a_grid() -> None:
+    """The Hankel form has no such number, and would ignore it without a word."""
+    assert choose(query(singlet(), samples=256)).on_grid
+    with pytest.raises(ValueError, match="a pupil of 64 samples is too coarse .* Use samples >="):
+        singlet().psf([WAVELENGTH], distances=0.1, pixel_pitch=PITCH, shape=(65, 65), samples=64)
+
+
 def test_a_symmetric_lens_takes_the_hankel_transform() -> None:
     lens = small_lens(optics.RadialDOE(torch.rand(10)), optics.Defocus(0.1))
     for physics in ("nonparaxial", "fresnel"):
