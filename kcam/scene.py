@@ -248,6 +248,35 @@ class Scene:
         """The same scene at other distances [m]."""
         return replace(self, depth=depth)
 
+    def low_rank(self, rank: int) -> Scene:
+        """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.
+
+        bands = U S V^T, the first `rank` columns of V kept. Where that would be negative, a pixel keeps only so much of
+        the columns after the first, which has one sign, that it is not. With the scene's own rank it is the same scene.
+
+        Raises:    ValueError for a rank below 1. A rank above what the scene can have is that one.
+        """
+        if rank < 1:
+            raise ValueError(f"rank must be at least 1, got {rank}.")
+        planes, spectra = self.coefficients, self.spectra
+        flat = planes.detach().double().transpose(0, 1).flatten(1)
+        gram = flat @ flat.T
+        mixing = torch.eye(len(gram), dtype=gram.dtype, device=gram.device) if spectra is None else spectra.detach()
+        gram = mixing.T.double() @ gram @ mixing.double()
+        directions = torch.linalg.eigh(gram).eigenvectors.flip(-1)[:, : min(rank, planes.shape[1])].to(planes)
+        directions[:, 0].abs_()
+        with full_precision(self.device):
+            onto = directions if spectra is None else spectra @ directions
+            new = torch.einsum("bkhw,kr->brhw", planes, onto)
+            share = torch.ones_like(new[:, 0])
+            for direction in directions:
+                first = new[:, 0] * direction[0]
+                rest = torch.einsum("brhw,r->bhw", new[:, 1:], direction[1:])
+                most = -first / rest.clamp(max=-torch.finfo(rest.dtype).tiny)  # no NaN gradient where rest is 0
+                share = torch.where(first + share * rest < 0, most, share)
+        new = torch.cat([new[:, :1], new[:, 1:] * share[:, None]], dim=1)
+        return replace(self, coefficients=new, spectra=directions.T)
+
     def crop(self, *, top: int, left: int, height: int, width: int) -> Scene:
         """A window of the scene, `height` x `width` pixels. Raises: ValueError unless it lies inside."""
         _, full_height, full_width = self.shape

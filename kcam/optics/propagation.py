@@ -277,11 +277,13 @@ PROPAGATORS = _rows()
 PHYSICS = tuple(dict.fromkeys(physics for physics, _ in PROPAGATORS))
 
 
-def choose(query: Query, *, propagator: str = "nonparaxial", method: str | None = None) -> Propagator:
-    """The row that answers a query: the method named, or the cheapest exact one that is valid.
+def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method: str | None = None) -> Propagator:
+    """The row that answers a query: the one given, the method named, or the cheapest exact one that is valid.
 
     Raises: ValueError for an unknown propagator or method, listing the known ones.
     """
+    if isinstance(propagator, Propagator):
+        return propagator
     if propagator not in PHYSICS:
         raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
     rows = [row for (physics, _), row in PROPAGATORS.items() if physics == propagator]
