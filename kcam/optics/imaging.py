@@ -8,6 +8,7 @@ scene's factors, and back once per channel, not once per band.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -103,6 +104,11 @@ class Imaging(Stage):
         query = self._query(wavelength_grid([550e-9]), torch.zeros(1), self.psf_shape or (1, 1), torch.empty(0))
         if method is not None:
             choose(query, propagator=propagator, method=method)  # refuses a method that does not exist
+
+    def changed(self, **arguments: Any) -> Imaging:
+        """The same stage with some of its constructor's arguments changed; it shares the lens and has kept nothing."""
+        own = {name: getattr(self, name) for name in inspect.signature(Imaging).parameters}
+        return Imaging(**(own | arguments))
 
     def provides(self) -> dict[str, Any]:
         """The optics, for exposure in physical units."""

@@ -525,12 +525,7 @@ def test_a_window_is_never_larger_than_the_picture_and_always_odd() -> None:
 
 def fresh(stage: optics.Imaging) -> optics.Imaging:
     """A new stage with the same optics and nothing kept."""
-    names = (
-        "pixel_pitch", "propagator", "method", "samples", "psf_shape", "layers", "border", "fill_factor", "distance",
-        "integrate", "bands", "interpolate",
-    )  # fmt: skip
-    new = optics.Imaging(copy.deepcopy(stage.lens), **{name: getattr(stage, name) for name in names})
-    return new
+    return stage.changed(lens=copy.deepcopy(stage.lens))
 
 
 def change_data(stage: optics.Imaging) -> None:
@@ -750,6 +745,16 @@ def test_a_propagator_of_ones_own() -> None:
     scene = cube(depth=1.5, bands=2)
     assert relative(stage(scene), F.avg_pool2d(scene.bands(), 3, 1, 1)) < 1e-13
     assert choose(stage._query(scene.wavelengths, torch.ones(1), (3, 3), scene.coefficients), propagator=row) is row
+
+
+def test_a_changed_stage_differs_in_what_was_named() -> None:
+    stage = imaging(bands=3, layers=2, border="zero")
+    changed = stage.changed(bands=None, psf_shape=(9, 9))
+    assert (changed.bands, changed.psf_shape, changed.layers, changed.border) == (None, (9, 9), 2, "zero")
+    assert changed.lens is stage.lens
+    assert (stage.bands, stage.psf_shape) == (3, None)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'band'"):
+        stage.changed(band=3)
 
 
 def test_what_trades_accuracy_for_time_is_saved(tmp_path: Path) -> None:
