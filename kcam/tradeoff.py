@@ -28,14 +28,14 @@ from kcam.camera import DEMOSAICING, Camera
 from kcam.optics import PROPAGATORS, Imaging
 from kcam.optics.propagation import Propagator, choose
 from kcam.optics.psf import Query, ray_displacement, samples_by_rule
-from kcam.optics.reference import Convergence, convergence
+from kcam.optics.reference import Convergence, checked_psf
 from kcam.optics.textbook import textbook_angular_spectrum_row, textbook_row
 from kcam.scene import Scene
 
 WINDOW, THOROUGH_WINDOW = 33, 65  # pixels in which PSFs are compared: the reference takes 4 to 24 s for six of 65 x 65
 MARGIN = 8  # pixels that the reference is computed beyond them: light cut off there is missing in the pixels' filter
-SECONDS, THOROUGH_SECONDS = 140.0, 900.0  # the sweep's time in all, as far as it can choose
-LONGEST, THOROUGH_LONGEST = 8.0, 120.0  # seconds of a picture above which its time is told from a few of its PSFs
+SECONDS, THOROUGH_SECONDS = 160.0, 900.0  # the sweep's time in all, as far as it can choose
+LONGEST, THOROUGH_LONGEST = 6.0, 120.0  # seconds of a picture above which its time is told from a few of its PSFs
 ONCE = 2.5  # seconds of a picture above which one more call must do
 REFERENCE_KAPPA = 4.5  # of the reference picture's pupil sampling: a thousandth of the default's error
 KAPPAS, THOROUGH_KAPPAS = (1.3, 1.6, 2.0, 2.7, 3.5, 5.0), (1.15, 1.3, 1.6, 2.0, 2.35, 2.7, 3.5, 4.2, 5.0)
@@ -452,7 +452,7 @@ class _Truth:
             samples=None,
         )
         start = time.process_time()
-        psfs = PROPAGATORS["reference", "quadrature"](query)
+        psfs, measured = checked_psf(query)
         seconds = time.process_time() - start
         count = _sample_counts(imaging, scene, [REFERENCE_KAPPA])[0]
         fine = _with(camera, propagator="nonparaxial", method=None, samples=count)
@@ -462,7 +462,7 @@ class _Truth:
         if any(isinstance(stage, isp.Demosaic) for stage in camera):
             others = [s for s in fine.noiseless() if not isinstance(s, (sensor.Mosaic, isp.Demosaic))]
             full = _shot(Camera(*others, context=camera.resolve()), double)[1]
-        return cls(query, bands, _centred(psfs, window), seconds, convergence(query), raw, picture, full)
+        return cls(query, bands, _centred(psfs, window), seconds, measured, raw, picture, full)
 
     def facts(self) -> dict[str, Any]:
         """For the JSON."""
@@ -503,11 +503,10 @@ def _measured(setting: Setting, truth: _Truth, *, longest: float) -> Row:
                 row, psf_l1=error, psf_l1_worst=error, seconds=truth.seconds * all_of_them, share=1 / all_of_them
             )
         if setting.optics:
-            psfs, errors, seconds = _psf_errors(imaging, scene, truth, patience=longest / 3)
+            errors, seconds, share = _psf_errors(imaging, scene, truth, longest=longest)
             row = replace(row, psf_l1=float(np.median(errors)), psf_l1_worst=max(errors))
-            count = _psf_count(imaging, scene)
-            if seconds * count / psfs > longest:
-                return replace(row, seconds=seconds * count / psfs, share=psfs / count)
+            if seconds / share > longest:
+                return replace(row, seconds=seconds / share, share=share)
         camera = setting.camera.noiseless()
         fresh = _with(camera)
         (raw, picture), first, memory = measure.watched(lambda: _shot(fresh, scene))
@@ -528,11 +527,11 @@ def _psf_count(imaging: Imaging, scene: Scene) -> int:
     return len(layers) * min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
 
 
-def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, patience: float) -> tuple[int, list[float], float]:
-    """(how many PSFs were computed, the L1 errors of those that are compared, CPU seconds once caches are warm).
+def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, longest: float) -> tuple[list[float], float, float]:
+    """(L1 errors of the PSFs that are compared, CPU seconds that these took, their share of a picture's PSFs).
 
     The PSFs are computed in the window that the picture needs and cut to that of the comparison. If those of the middle
-    wavelength take longer than `patience`, they must do.
+    wavelength alone take a third of `longest`, they must do.
     """
     like = scene.coefficients[:0]
     vergences, shape = truth.query.vergences, _query(imaging, scene).shape
@@ -545,15 +544,17 @@ def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, patience: floa
         return bank, time.process_time() - start
 
     bank, seconds = compute()
-    if seconds < patience:
+    if seconds < longest / 3:
         part = torch.arange(len(truth.bands))
-        bank, cold = compute()
-        seconds = compute()[1] if cold < patience else cold
-    psfs = len(vergences) * (min(imaging.bands, len(scene.wavelengths)) if imaging.bands else len(part))
+        bank, seconds = compute()
+    computed = min(imaging.bands, len(scene.wavelengths)) if imaging.bands else len(part)
+    share = len(vergences) * computed / _psf_count(imaging, scene)
+    if seconds < longest / 3 and seconds / share > longest:
+        seconds = compute()[1]  # tables that every bank shares are there now
     bank = _centred(bank[:, truth.bands[part]] if imaging.bands else bank, truth.psfs.shape[-1]).double()
     expected = truth.psfs[:, part]
     errors = ((bank - expected).abs().sum((-2, -1)) / expected.sum((-2, -1))).flatten().tolist()
-    return psfs, errors, seconds
+    return errors, seconds, share
 
 
 def _centred(bank: Tensor, side: int) -> Tensor:
