@@ -200,7 +200,7 @@ class Scene:
             picture, depth = PHOTOGRAPHS[name]()
             image = torch.tensor(picture).permute(2, 0, 1) / 255
             scene = cls.from_rgb(image, depth=depth, wavelengths=grid, illuminant=light, luminance=luminance)
-            return _resized(scene, _target_shape(size, scene.shape[1:]))
+            return scene if size is None else scene.resized(size)
         draw, shape = CHARTS[name]
         planes, reflectance = draw(*_target_shape(size, shape), grid)
         return cls(planes, reflectance * light, grid, illuminant=light, luminance=luminance)
@@ -247,6 +247,14 @@ class Scene:
     def with_depth(self, depth: float | Tensor) -> Scene:
         """The same scene at other distances [m]."""
         return replace(self, depth=depth)
+
+    def resized(self, size: int | tuple[int, int]) -> Scene:
+        """The scene at another size: the longer side [pixels], or (height, width), for which it is cropped in its
+        middle. Colours are filtered in linear light, distances picked.
+
+        Raises:    ValueError for a size below 1.
+        """
+        return _resized(self, _target_shape(size, self.shape[1:]))
 
     def low_rank(self, rank: int) -> Scene:
         """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.

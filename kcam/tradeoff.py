@@ -34,7 +34,7 @@ from kcam.scene import Scene
 
 WINDOW, THOROUGH_WINDOW = 33, 65  # pixels in which PSFs are compared: the reference takes 4 to 24 s for six of 65 x 65
 MARGIN = 8  # pixels that the reference is computed beyond them: light cut off there is missing in the pixels' filter
-SECONDS, THOROUGH_SECONDS = 160.0, 900.0  # the sweep's time in all, as far as it can choose
+SECONDS, THOROUGH_SECONDS = 150.0, 900.0  # the sweep's time in all, as far as it can choose
 LONGEST, THOROUGH_LONGEST = 6.0, 120.0  # seconds of a picture above which its time is told from a few of its PSFs
 ONCE = 2.5  # seconds of a picture above which one more call must do
 REFERENCE_KAPPA = 4.5  # of the reference picture's pupil sampling: a thousandth of the default's error
@@ -62,7 +62,7 @@ class Setting:
 class Row:
     """What a setting was measured to cost. None stands for what it does not change, or could not be measured.
 
-    psf_l1, psf_l1_worst: median and worst over wavelengths and distances, relative to the light in the window.
+    psf_l1, psf_l1_worst: median and worst over wavelengths and distances, relative to the light.
     raw_rms: relative RMS error of the noiseless raw, before rounding. delta_e: mean CIEDE2000 of the picture.
     seconds: of a picture with new optics, nothing kept from one before; seconds_iqr: quartiles over the `calls`.
     seconds_kept: of one more picture with the same optics. share: of the PSFs that the time was measured on, if not 1.
@@ -136,10 +136,10 @@ class Sweep:
     def table(self) -> Table:
         """The rows for a terminal, knob by knob; * marks those on the front of raw error and time."""
         table = Table(title=f"[bold]{self.title}[/]  [dim]{self.scene}[/]", title_justify="left", box=None)
-        table.add_column("")
+        table.add_column("", min_width=1, no_wrap=True)
         for name in ("knob", "setting"):
             table.add_column(name, no_wrap=True)
-        for name in ("PSF L1", "worst", "raw RMS", "delta E", "ms", "IQR", "MB"):
+        for name in ("PSF L1", "worst", "raw RMS", "delta E", "time", "quartiles, ms", "MB"):
             table.add_column(name, justify="right", no_wrap=True)
         before = ""
         for row in self.rows:
@@ -154,7 +154,7 @@ class Sweep:
                 *head,
                 *(_small(value) for value in (row.psf_l1, row.psf_l1_worst, row.raw_rms)),
                 _number(row.delta_e, "{:.3f}"),
-                ("~" if row.share < 1 else "") + _number(row.seconds, "{:.0f}", 1e3),
+                ("~" if row.share < 1 else "") + _time(row.seconds),
                 "" if low is None else f"{low * 1e3:.0f}-{high * 1e3:.0f}",
                 _number(row.peak_memory, "{:.0f}", 1e-6),
                 style=style,
@@ -432,6 +432,7 @@ class _Truth:
     query: Query  # at three wavelengths
     bands: Tensor  # which of the scene's they are
     psfs: Tensor  # in the small window
+    beyond: Tensor  # the light that the picture's window holds outside it
     seconds: float  # that the query took
     convergence: Convergence
     raw: Tensor
@@ -457,18 +458,22 @@ class _Truth:
         count = _sample_counts(imaging, scene, [REFERENCE_KAPPA])[0]
         fine = _with(camera, propagator="nonparaxial", method=None, samples=count)
         double = scene.to(dtype=torch.float64)
+        whole = _imaging(fine).psf_bank(
+            query.wavelengths, vergences=query.vergences, shape=_query(imaging, scene).shape, like=psfs
+        )
         raw, picture = _shot(fine.noiseless(), double)
         full = None
         if any(isinstance(stage, isp.Demosaic) for stage in camera):
             others = [s for s in fine.noiseless() if not isinstance(s, (sensor.Mosaic, isp.Demosaic))]
             full = _shot(Camera(*others, context=camera.resolve()), double)[1]
-        return cls(query, bands, _centred(psfs, window), seconds, measured, raw, picture, full)
+        beyond = _light(whole) - _light(_centred(whole, window))
+        return cls(query, bands, _centred(psfs, window), beyond, seconds, measured, raw, picture, full)
 
     def facts(self) -> dict[str, Any]:
         """For the JSON."""
         return {
             "psf": "non-paraxial in float64: the reference propagator",
-            "window": list(self.psfs.shape[-2:]),
+            "window": list(self.psfs.shape[-2:]),  # beyond it, all light as one number
             "wavelengths": self.query.wavelengths.tolist(),
             "vergences": self.query.vergences.tolist(),
             "doubled_sampling_changes": self.convergence.doubled,
@@ -530,7 +535,8 @@ def _psf_count(imaging: Imaging, scene: Scene) -> int:
 def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, longest: float) -> tuple[list[float], float, float]:
     """(L1 errors of the PSFs that are compared, CPU seconds that these took, their share of a picture's PSFs).
 
-    The PSFs are computed in the window that the picture needs and cut to that of the comparison. If those of the middle
+    The PSFs are computed in the window that the picture needs and compared pixel by pixel in the middle of it; the
+    light around the middle is compared as one number, so that a window too small shows. If those of the middle
     wavelength alone take a third of `longest`, they must do.
     """
     like = scene.coefficients[:0]
@@ -551,10 +557,14 @@ def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, longest: float
     share = len(vergences) * computed / _psf_count(imaging, scene)
     if seconds < longest / 3 and seconds / share > longest:
         seconds = compute()[1]  # tables that every bank shares are there now
-    bank = _centred(bank[:, truth.bands[part]] if imaging.bands else bank, truth.psfs.shape[-1]).double()
-    expected = truth.psfs[:, part]
-    errors = ((bank - expected).abs().sum((-2, -1)) / expected.sum((-2, -1))).flatten().tolist()
-    return errors, seconds, share
+    bank = (bank[:, truth.bands[part]] if imaging.bands else bank).double()
+    inner, expected, beyond = _centred(bank, truth.psfs.shape[-1]), truth.psfs[:, part], truth.beyond[:, part]
+    difference = _light((inner - expected).abs()) + (_light(bank) - _light(inner) - beyond).abs()
+    return (difference / (_light(expected) + beyond)).flatten().tolist(), seconds, share
+
+
+def _light(bank: Tensor) -> Tensor:
+    return bank.sum((-2, -1))
 
 
 def _centred(bank: Tensor, side: int) -> Tensor:
@@ -627,7 +637,7 @@ def _small(error: float | None) -> str:
 
 def _time(seconds: float | None) -> str:
     seconds = seconds or 0.0
-    return f"{seconds:.2g} s" if seconds >= 1 else f"{seconds * 1e3:.3g} ms"
+    return f"{seconds * 1e3:.0f} ms" if seconds < 1 else f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
 
 
 def _ratio(row: Row, other: Row) -> str:
