@@ -440,7 +440,7 @@ def _place_labels(
         probe = axes.text(0, 0, text, **style)
         extent = probe.get_window_extent(renderer)
         probe.remove()
-        wide, high = extent.width, extent.height * 0.85
+        wide, high = extent.width * 1.04, extent.height * 0.85  # hinting makes text wider at other resolutions
         choices = []
         for radius in (7, 11, 17, 25, 34, 45, 58, 74, 92, 112, 135):
             for step in range(24):
@@ -458,6 +458,8 @@ def _place_labels(
                 struck += inside(box, drawn) > 0
                 sideways = 0 if abs(dy) < 0.5 * abs(dx) else 2  # a label beside its point reads best
                 choices.append((1e4 * out + 1e3 * clash + 300 * covered + 150 * struck + radius + sideways, box, line))
+            if min(choices, key=lambda choice: choice[0])[0] < radius + 3:
+                break  # farther away it can only be worse
         _, box, line = min(choices, key=lambda choice: choice[0])
         taken.append(box)
         lines.append(line)

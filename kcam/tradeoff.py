@@ -34,8 +34,8 @@ from kcam.scene import Scene
 
 WINDOW, THOROUGH_WINDOW = 33, 65  # pixels in which PSFs are compared: the reference takes 4 to 24 s for six of 65 x 65
 MARGIN = 8  # pixels that the reference is computed beyond them: light cut off there is missing in the pixels' filter
-SECONDS, THOROUGH_SECONDS = 150.0, 900.0  # the sweep's time in all, as far as it can choose
-LONGEST, THOROUGH_LONGEST = 6.0, 120.0  # seconds of a picture above which its time is told from a few of its PSFs
+SECONDS, THOROUGH_SECONDS = 160.0, 900.0  # the sweep's time in all, as far as it can choose
+LONGEST, THOROUGH_LONGEST = 4.0, 120.0  # seconds of a picture above which its time is told from a few of its PSFs
 ONCE = 2.5  # seconds of a picture above which one more call must do
 REFERENCE_KAPPA = 4.5  # of the reference picture's pupil sampling: a thousandth of the default's error
 KAPPAS, THOROUGH_KAPPAS = (1.3, 1.6, 2.0, 2.7, 3.5, 5.0), (1.15, 1.3, 1.6, 2.0, 2.35, 2.7, 3.5, 4.2, 5.0)
@@ -147,7 +147,7 @@ class Sweep:
             head = ["*" if row.pareto else "", "" if row.knob == before else row.knob, row.name]
             before = row.knob
             if row.refused is not None:
-                table.add_row(*head, f"[dim]{_shortened(row.refused)}[/]", style=style)
+                table.add_row(*head, "refused", style="dim")
                 continue
             low, high = row.seconds_iqr or (None, None)
             table.add_row(
@@ -163,6 +163,8 @@ class Sweep:
             "Empty: the knob does not change it, or it was not measured. ~: told from a few of the PSFs. Demosaics are "
             "held to the same camera with three full planes, so their delta E stands by itself."
         )
+        table.caption += "".join(f"\n{row.name} refused: {row.refused}" for row in self.rows if row.refused)
+        table.caption_justify = "left"
         return table
 
     def to_json(self) -> dict[str, Any]:
@@ -444,8 +446,10 @@ class _Truth:
         imaging = _imaging(camera)
         order = scene.wavelengths.argsort()
         bands = torch.unique(torch.stack([order[0], order[len(order) // 2], order[-1]]))
+        whole = _query(imaging, scene)
+        window = (min(window, *whole.shape) - 1) // 2 * 2 + 1  # odd, and no larger than what the picture uses
         query = replace(
-            _query(imaging, scene),
+            whole,
             wavelengths=scene.wavelengths[bands],
             shape=(window + 2 * MARGIN, window + 2 * MARGIN),
             dtype=torch.float64,
@@ -458,15 +462,13 @@ class _Truth:
         count = _sample_counts(imaging, scene, [REFERENCE_KAPPA])[0]
         fine = _with(camera, propagator="nonparaxial", method=None, samples=count)
         double = scene.to(dtype=torch.float64)
-        whole = _imaging(fine).psf_bank(
-            query.wavelengths, vergences=query.vergences, shape=_query(imaging, scene).shape, like=psfs
-        )
+        bank = _imaging(fine).psf_bank(query.wavelengths, vergences=query.vergences, shape=whole.shape, like=psfs)
         raw, picture = _shot(fine.noiseless(), double)
         full = None
         if any(isinstance(stage, isp.Demosaic) for stage in camera):
             others = [s for s in fine.noiseless() if not isinstance(s, (sensor.Mosaic, isp.Demosaic))]
             full = _shot(Camera(*others, context=camera.resolve()), double)[1]
-        beyond = _light(whole) - _light(_centred(whole, window))
+        beyond = _light(bank) - _light(_centred(bank, window))
         return cls(query, bands, _centred(psfs, window), beyond, seconds, measured, raw, picture, full)
 
     def facts(self) -> dict[str, Any]:
@@ -646,7 +648,3 @@ def _ratio(row: Row, other: Row) -> str:
 
 def _number(value: float | None, form: str, scale: float = 1.0) -> str:
     return "" if value is None else form.format(value * scale)
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= 60 else f"{text[:57]}..."
