@@ -6,17 +6,10 @@ ratio is taken within the round. What is published is the median of the rounds' 
 
 from __future__ import annotations
 
-import ctypes
-import json
-import platform
-import re
 import statistics
 import subprocess
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +18,10 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from kcam import measure
+from kcam.measure import write_json as write_json
+
 ROOT = Path(__file__).parents[1]
-VERSIONS = ("torch", "numpy", "scipy", "kornia")
 
 
 @dataclass(frozen=True)
@@ -65,7 +60,7 @@ def race(
     """
     rows, once = [], []
     for contestant in contestants:
-        result, first_call, memory = _watched(contestant.call)
+        result, first_call, memory = measure.watched(contestant.call)
         rows.append(
             {
                 "op": op,
@@ -84,7 +79,7 @@ def race(
             }
         )
         del result
-        once.append(_cpu_time(contestant.call) if contestant.ours else first_call)
+        once.append(measure.cpu_time(contestant.call) if contestant.ours else first_call)
     repeats = [0 if c.once else max(1, min(5, int(0.25 * once[0] / t))) for c, t in zip(contestants, once, strict=True)]
     round_time = sum(t * r for t, r in zip(once, repeats, strict=True))
     rounds = max(3, min(most_rounds, int(seconds / round_time))) if seconds else 1
@@ -94,7 +89,7 @@ def race(
     for _ in range(rounds):
         for own, contestant, count in zip(times, contestants, repeats, strict=True):
             if count:
-                own.append([_cpu_time(contestant.call) / contestant.share for _ in range(count)])
+                own.append([measure.cpu_time(contestant.call) / contestant.share for _ in range(count)])
     for row, own in zip(rows, times, strict=True):
         every = [t for part in own for t in part]
         # zip: a contestant that is timed once meets the first round alone
@@ -115,46 +110,13 @@ def _error_ratio(row: dict[str, Any], rows: list[dict[str, Any]]) -> float | Non
     return min((best[kind] / row["error"][kind] for kind in kinds), default=None)
 
 
-def _cpu_time(call: Callable[[], Any]) -> float:
-    start = time.process_time()
-    call()
-    return time.process_time() - start
-
-
-def _watched(call: Callable[[], Any]) -> tuple[Any, float, int | None]:
-    """(result, CPU seconds, bytes of memory at the peak beyond those at the start; None where Linux does not say)."""
-    before = _resident(reset=True)
-    start = time.process_time()
-    result = call()
-    seconds = time.process_time() - start
-    peak = _resident()
-    return result, seconds, None if before is None or peak is None else max(0, peak - before)
-
-
-def _resident(*, reset: bool = False) -> int | None:
-    """Peak resident memory of this process since the last reset [bytes]."""
-    try:
-        if reset:
-            ctypes.CDLL(None).malloc_trim(0)  # what the allocator keeps would hide what the call needs
-            Path("/proc/self/clear_refs").write_text("5")
-        return int(re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())[1]) * 1024
-    except (OSError, AttributeError, TypeError):
-        return None
-
-
 # ---- what is written ---------------------------------------------------------------------------------------------
 
 
 def environment() -> dict[str, Any]:
     """Where and when: commit, versions, machine, date."""
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _commit(),
-        "versions": {"python": platform.python_version(), **{name: metadata.version(name) for name in VERSIONS}},
-        "machine": f"{platform.system()} {platform.machine()}, {_processor()}",
-        "threads": torch.get_num_threads(),
-        "clock": "CPU seconds of the process; ratios are taken within a round, and their median is given",
-    }
+    clock = "CPU seconds of the process; ratios are taken within a round, and their median is given"
+    return measure.environment() | {"commit": _commit(), "clock": clock}
 
 
 def _commit() -> str:
@@ -168,28 +130,6 @@ def _commit() -> str:
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return head.stdout.strip() + (" with changes" if changed.stdout.strip() else "")
-
-
-def _processor() -> str:
-    try:
-        found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
-    except OSError:
-        found = None
-    return found[1] if found else platform.processor() or "unknown processor"
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Numbers with four digits: more would only make diffs."""
-
-    def rounded(value: Any) -> Any:
-        if isinstance(value, float):
-            return float(f"{value:.4g}")
-        if isinstance(value, dict):
-            return {key: rounded(item) for key, item in value.items()}
-        return [rounded(item) for item in value] if isinstance(value, list) else value
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(rounded(content), indent=1) + "\n")
 
 
 def print_table(console: Console, rows: list[dict[str, Any]]) -> None:

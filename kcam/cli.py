@@ -1,4 +1,4 @@
-"""The command `kcam`: demo, shoot, psf. The one place where quantities are strings with units."""
+"""The command `kcam`: demo, shoot, psf, tradeoff. The one place where quantities are strings with units."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from kcam import __version__
 
 if TYPE_CHECKING:
     from kcam.camera import Camera
+    from kcam.scene import Scene
 
 UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
-CameraOption = Annotated[str, typer.Option("--camera", help="thesis, ideal, phone, or a file that Camera.save wrote")]
+CameraOption = Annotated[
+    str, typer.Option("--camera", help="thesis, ideal, phone, singlet, or a file that Camera.save wrote")
+]
 
 
 def length(text: str, *, unit: str = "m", name: str = "distance") -> float:
@@ -48,14 +51,31 @@ def lengths(text: str, *, unit: str, name: str) -> list[float]:
 
 
 def open_camera(name: str) -> Camera:
-    """A preset by its name, or a saved camera by its path."""
+    """A preset by its name, the demo's singlet, or a saved camera by its path."""
     from kcam.camera import PRESETS, Camera
 
     if name in PRESETS:
         return Camera.preset(name)
+    if name == "singlet":
+        from kcam import demo
+
+        return demo.singlet()
     if Path(name).suffix or Path(name).exists():
         return Camera.load(name)
-    raise ValueError(f'unknown camera "{name}": expected a preset ({", ".join(PRESETS)}) or a saved .safetensors file.')
+    raise ValueError(
+        f'unknown camera "{name}": expected a preset ({", ".join(PRESETS)}, singlet) or a saved .safetensors file.'
+    )
+
+
+def open_scene(name: str, *, size: int) -> Scene:
+    """A built-in scene by its name, or a picture by its path, at most `size` pixels long."""
+    from kcam.scene import BUILTIN, Scene
+
+    if name in BUILTIN:
+        return Scene.builtin(name, size)
+    if Path(name).suffix or Path(name).exists():
+        return Scene.from_file(name).resized(size)
+    raise ValueError(f'unknown scene "{name}": expected one of {", ".join(BUILTIN)}, or a picture file.')
 
 
 @contextmanager
@@ -166,6 +186,45 @@ def psf(
             )
         plots.save_figure(figure, out)
         typer.echo(out)
+
+
+@app.command()
+def tradeoff(
+    camera: CameraOption = "singlet",
+    scene: Annotated[
+        str,
+        typer.Option(
+            "--scene", help="a built-in scene or a picture; motorcycle, with depth, unless the lens has a DOE"
+        ),
+    ] = "",
+    size: Annotated[int, typer.Option("--size", help="of the scene's longer side [pixels]")] = 128,
+    out: Annotated[Path, typer.Option("--out", help="folder for tradeoff.json and tradeoff.png")] = Path("tradeoff"),
+    thorough: Annotated[bool, typer.Option("--thorough", help="more settings; 15 minutes rather than 3")] = False,
+) -> None:
+    """Measure what accuracy costs in time: turn every knob of a camera, and compare with the reference."""
+    with one_line_errors():
+        from kcam import plots
+        from kcam import tradeoff as module
+
+        stages = open_camera(camera)
+        name = scene or ("coffee" if any(_is_doe(part) for part in stages.modules()) else "motorcycle")
+        light = open_scene(name, size=size)
+        out.mkdir(parents=True, exist_ok=True)
+        with progress("tradeoff") as advance:
+            result = module.sweep(
+                stages, light, thorough=thorough, advance=advance, title=f"{Path(camera).stem} on {Path(name).stem}"
+            )
+        result.save(out / "tradeoff.json")
+        plots.save_figure(plots.tradeoff_figure(result), out / "tradeoff.png")
+        Console(width=max(116, err.width)).print(result.table())
+        typer.echo(f"\n{result.sentence()}\n\n{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}")
+
+
+def _is_doe(part: object) -> bool:
+    """Flat pixels make a PSF some ten times as slow; with a PSF for every depth a sweep would take half an hour."""
+    from kcam import optics
+
+    return isinstance(part, optics.DOE)
 
 
 def main() -> None:

@@ -200,7 +200,7 @@ class Scene:
             picture, depth = PHOTOGRAPHS[name]()
             image = torch.tensor(picture).permute(2, 0, 1) / 255
             scene = cls.from_rgb(image, depth=depth, wavelengths=grid, illuminant=light, luminance=luminance)
-            return _resized(scene, _target_shape(size, scene.shape[1:]))
+            return scene if size is None else scene.resized(size)
         draw, shape = CHARTS[name]
         planes, reflectance = draw(*_target_shape(size, shape), grid)
         return cls(planes, reflectance * light, grid, illuminant=light, luminance=luminance)
@@ -247,6 +247,43 @@ class Scene:
     def with_depth(self, depth: float | Tensor) -> Scene:
         """The same scene at other distances [m]."""
         return replace(self, depth=depth)
+
+    def resized(self, size: int | tuple[int, int]) -> Scene:
+        """The scene at another size: the longer side [pixels], or (height, width), for which it is cropped in its
+        middle. Colours are filtered in linear light, distances picked.
+
+        Raises:    ValueError for a size below 1.
+        """
+        return _resized(self, _target_shape(size, self.shape[1:]))
+
+    def low_rank(self, rank: int) -> Scene:
+        """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.
+
+        bands = U S V^T, the first `rank` columns of V kept. Where that would be negative, a pixel keeps only so much of
+        the columns after the first, which has one sign, that it is not. With the scene's own rank it is the same scene.
+
+        Raises:    ValueError for a rank below 1. A rank above what the scene can have is that one.
+        """
+        if rank < 1:
+            raise ValueError(f"rank must be at least 1, got {rank}.")
+        planes, spectra = self.coefficients, self.spectra
+        flat = planes.detach().double().transpose(0, 1).flatten(1)
+        gram = flat @ flat.T
+        mixing = torch.eye(len(gram), dtype=gram.dtype, device=gram.device) if spectra is None else spectra.detach()
+        gram = mixing.T.double() @ gram @ mixing.double()
+        directions = torch.linalg.eigh(gram).eigenvectors.flip(-1)[:, : min(rank, planes.shape[1])].to(planes)
+        directions[:, 0].abs_()
+        with full_precision(self.device):
+            onto = directions if spectra is None else spectra @ directions
+            new = torch.einsum("bkhw,kr->brhw", planes, onto)
+            share = torch.ones_like(new[:, 0])
+            for direction in directions:
+                first = new[:, 0] * direction[0]
+                rest = torch.einsum("brhw,r->bhw", new[:, 1:], direction[1:])
+                most = -first / rest.clamp(max=-torch.finfo(rest.dtype).tiny)  # no NaN gradient where rest is 0
+                share = torch.where(first + share * rest < 0, most, share)
+        new = torch.cat([new[:, :1], new[:, 1:] * share[:, None]], dim=1)
+        return replace(self, coefficients=new, spectra=directions.T)
 
     def crop(self, *, top: int, left: int, height: int, width: int) -> Scene:
         """A window of the scene, `height` x `width` pixels. Raises: ValueError unless it lies inside."""

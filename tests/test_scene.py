@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -272,6 +273,43 @@ class TestScene:
             Scene(planes, spectra, luminance=0.0)
         with pytest.raises(ValueError, match="unknown illuminant 'sun'"):
             Scene(planes, spectra, illuminant="sun")
+
+
+class TestLowRank:
+    @staticmethod
+    def error(scene: Scene, truth: Scene) -> float:
+        return float((scene.bands() - truth.bands()).norm() / truth.bands().norm())
+
+    @pytest.mark.parametrize("as_bands", [True, False])
+    def test_it_is_the_truncated_svd(self, as_bands: bool) -> None:
+        scene = Scene.from_rgb(0.4 + 0.2 * picture(2, 3, 9, 11, dtype=torch.float64))  # pale: no truncation is negative
+        cube = scene.bands().transpose(0, 1).flatten(1)
+        u, s, v = torch.linalg.svd(cube, full_matrices=False)
+        scene = replace(scene, coefficients=scene.bands(), spectra=None) if as_bands else scene
+        for rank in (1, 2, 3):
+            low = scene.low_rank(rank)
+            assert low.coefficients.shape[1] == rank
+            best = (u[:, :rank] * s[:rank]) @ v[:rank]
+            assert torch.allclose(low.bands().transpose(0, 1).flatten(1), best, atol=1e-10)
+        assert self.error(scene.low_rank(3), scene) < 1e-12  # pictures have three factors
+
+    def test_light_stays_light(self) -> None:
+        scene = Scene.builtin("colour_chart", 48)  # 24 reflectances, saturated ones among them
+        errors = [self.error(scene.low_rank(rank), scene) for rank in (1, 2, 3, 6, 24)]
+        assert errors == sorted(errors, reverse=True)
+        assert errors[-1] < 1e-6  # all that there are
+        assert all(scene.low_rank(rank).bands().min() > -1e-6 for rank in (1, 2, 3, 6))
+        cube = scene.bands().double()[0].flatten(1)
+        u, s, v = torch.linalg.svd(cube, full_matrices=False)
+        assert ((u[:, :2] * s[:2]) @ v[:2]).min() < -0.01, "the plain truncation is negative here"
+
+    def test_gradients_and_bad_input(self) -> None:
+        image = picture(3, 6, 7, dtype=torch.float64).requires_grad_()
+        Scene.from_rgb(image).low_rank(2).bands().square().sum().backward()
+        assert image.grad.isfinite().all()
+        assert Scene.from_rgb(torch.zeros(3, 4, 5)).low_rank(2).bands().abs().max() == 0
+        with pytest.raises(ValueError, match="rank must be at least 1, got 0"):
+            Scene.from_rgb(image).low_rank(0)
 
 
 class TestDepth:

@@ -8,9 +8,10 @@ scene's factors, and back once per channel, not once per band.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,7 +21,7 @@ from torch.utils.checkpoint import checkpoint
 from kcam.cache import ValueCache, fingerprint
 from kcam.context import Context, Stage
 from kcam.optics.lens import Lens
-from kcam.optics.propagation import PHYSICS, choose
+from kcam.optics.propagation import PHYSICS, Propagator, choose
 from kcam.optics.psf import Query, ray_displacement
 from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
@@ -44,9 +45,14 @@ class Imaging(Stage):
         lens: the optics.
         pixel_pitch: [m]. fill_factor: light-sensitive share of a pixel; the irradiance is its mean over that square.
         propagator, method, samples: as in `Lens.psf`. A number of samples freezes the pupil grid, which otherwise
-            follows the parameters in steps: give it together with psf_shape where a camera is differenced.
+            follows the parameters in steps: give it together with psf_shape where a camera is differenced. A propagator
+            may also be a row of one's own, an `optics.propagation.Propagator`; such a camera cannot be saved.
+        integrate: the light over each pixel; False takes point samples at the pixels' centres instead.
+        bands: number of wavelengths that have a PSF of their own; None: all. Fewer: neighbouring bands share the PSF of
+            their group's mean wavelength, whatever their number.
         psf_shape: (H, W) of the PSF's window in pixels; None: see `psf_window`.
         layers: number of depth layers over the range of a depth map; None: see `depth_layers`.
+        interpolate: between the layers, linearly in vergence; False puts each pixel into its nearest layer.
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
         distance: of a plain tensor [m]; None: where the lens is focused.
         max_memory: bytes that the transforms may take; bands are split to stay below, with the same result.
@@ -59,11 +65,14 @@ class Imaging(Stage):
         lens: Lens,
         *,
         pixel_pitch: float = 4e-6,
-        propagator: str = "nonparaxial",
+        propagator: str | Propagator = "nonparaxial",
         method: str | None = None,
         samples: int | None = None,
+        integrate: bool = True,
+        bands: int | None = None,
         psf_shape: tuple[int, int] | None = None,
         layers: int | None = None,
+        interpolate: bool = True,
         border: str = "reflect",
         fill_factor: float = 1.0,
         distance: float | None = None,
@@ -72,12 +81,14 @@ class Imaging(Stage):
         super().__init__()
         if not isinstance(lens, Lens):
             raise TypeError(f"Imaging takes an optics.Lens, got {type(lens).__name__}.")
-        if propagator not in PHYSICS:
+        if not isinstance(propagator, Propagator) and propagator not in PHYSICS:
             raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
         if border not in BORDERS:
             raise ValueError(f"unknown border {border!r}; known: {', '.join(BORDERS)}.")
         if layers is not None and layers < 1:
             raise ValueError(f"layers must be a positive number of depth layers, or None, got {layers}.")
+        if bands is not None and bands < 1:
+            raise ValueError(f"bands must be a positive number of wavelengths, or None for all, got {bands}.")
         if distance is not None:
             check_distances(distance)
         if not max_memory > 0:
@@ -86,12 +97,18 @@ class Imaging(Stage):
         self.pixel_pitch = check_pixel_pitch(pixel_pitch)
         self.propagator, self.method, self.samples = propagator, method, samples
         self.psf_shape = None if psf_shape is None else (int(psf_shape[0]), int(psf_shape[1]))
-        self.layers, self.border, self.fill_factor = layers, border, fill_factor
+        self.integrate, self.bands = integrate, bands
+        self.layers, self.interpolate, self.border, self.fill_factor = layers, interpolate, border, fill_factor
         self.distance, self.max_memory = distance, float(max_memory)
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
         query = self._query(wavelength_grid([550e-9]), torch.zeros(1), self.psf_shape or (1, 1), torch.empty(0))
         if method is not None:
             choose(query, propagator=propagator, method=method)  # refuses a method that does not exist
+
+    def changed(self, **arguments: Any) -> Imaging:
+        """The same stage with some of its constructor's arguments changed; it shares the lens and has kept nothing."""
+        own = {name: getattr(self, name) for name in inspect.signature(Imaging).parameters}
+        return Imaging(**(own | arguments))
 
     def provides(self) -> dict[str, Any]:
         """The optics, for exposure in physical units."""
@@ -180,24 +197,46 @@ class Imaging(Stage):
             shape=shape,
             samples=self.samples,
             fill_factor=self.fill_factor,
+            integrate=self.integrate,
             dtype=like.dtype,
             device=like.device,
         )
 
-    def _psfs(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
-        """(Z, L, h, w) in the dtype and on the device of `like`, kept while nothing changes."""
+    def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
+        """PSFs of the bands of a scene, (Z, L, h, w) in the dtype and on the device of `like`; kept while nothing
+        changes.
+        """
+        groups = list(wavelengths.argsort().tensor_split(min(self.bands or len(wavelengths), len(wavelengths))))
         query = self._query(wavelengths, vergences, shape, like)
+        if len(groups) < len(wavelengths):
+            query = replace(query, wavelengths=torch.stack([wavelengths[group].mean() for group in groups]))
 
         def build() -> Tensor:
-            return choose(query, propagator=self.propagator, method=self.method)(query)
+            psfs = choose(query, propagator=self.propagator, method=self.method)(query)
+            if len(groups) == len(wavelengths):
+                return psfs
+            owner = torch.empty(len(wavelengths), dtype=torch.long)
+            for index, group in enumerate(groups):
+                owner[group] = index
+            return psfs[:, owner.to(psfs.device)]
 
         if torch.is_grad_enabled() and any(p.requires_grad for p in self.lens.parameters()):
             return build()
         return self._bank_cache.get(self._optics_key(wavelengths, vergences, shape, like), build)
 
     def _optics_key(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> tuple:
-        names = (self.propagator, self.method, self.samples, self.pixel_pitch, self.fill_factor)
-        return (fingerprint(self.lens), names, wavelengths, vergences, shape, str(like.dtype), str(like.device))
+        how = (self.propagator, self.method, self.samples, self.integrate, self.bands)
+        pixel = (self.pixel_pitch, self.fill_factor)
+        return (fingerprint(self.lens), how, pixel, wavelengths, vergences, shape, str(like.dtype), str(like.device))
+
+    def _layer_shares(self, depth: Tensor, vergences: Tensor) -> Tensor:
+        """Share of each pixel in each layer, linear in vergence between neighbours or all in the nearest: (B, Z, H, W),
+        sums to 1.
+        """
+        position = (1 / depth - vergences[0].item()) / float(vergences[1] - vergences[0])
+        position = position if self.interpolate else position.round()
+        layers = torch.arange(vergences.numel(), device=depth.device, dtype=torch.float64)
+        return torch.clamp(1 - (position - layers[:, None, None]).abs(), min=0)
 
     # ---- rendering -------------------------------------------------------------------------------------------------
 
@@ -211,7 +250,7 @@ class Imaging(Stage):
         weights = None if contraction is None else contraction.to(planes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
         vergences = self.depth_layers(depth, scene.wavelengths)
-        shares = None if vergences.numel() == 1 else _layer_shares(depth, vergences).to(planes)
+        shares = None if vergences.numel() == 1 else self._layer_shares(depth, vergences).to(planes)
         if shares is not None:
             present = (shares.flatten(2).amax(dim=(0, 2)) > 0).cpu()
             vergences, shares = vergences[present], shares[:, present.to(shares.device)]
@@ -221,7 +260,8 @@ class Imaging(Stage):
         length = max(1, int(self.max_memory / 4 // per_layer))
         layers = _Layers(planes, shares)
         for start in range(0, vergences.numel(), length):
-            psfs = self._psfs(scene.wavelengths, vergences[start : start + length], window, planes)
+            some = vergences[start : start + length]
+            psfs = self.psf_bank(scene.wavelengths, vergences=some, shape=window, like=planes)
             renderer = _Renderer(self, psfs, spectra=spectra, weights=weights, picture=(height, width))
             layers.add(renderer, first=start)
         return layers.light
@@ -473,13 +513,6 @@ def _border_index(index: Tensor, n: int, border: str) -> Tensor:
         return index % n
     folded = index % (2 * n - 2)
     return torch.where(folded < n, folded, 2 * n - 2 - folded)
-
-
-def _layer_shares(depth: Tensor, vergences: Tensor) -> Tensor:
-    """Share of each pixel in each layer, linear in vergence between neighbours: (B, Z, H, W), sums to 1."""
-    position = (1 / depth - vergences[0].item()) / float(vergences[1] - vergences[0])
-    layers = torch.arange(vergences.numel(), device=depth.device, dtype=torch.float64)
-    return torch.clamp(1 - (position - layers[:, None, None]).abs(), min=0)
 
 
 class _Layers:

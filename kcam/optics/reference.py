@@ -44,18 +44,27 @@ class Convergence:
 def reference_psf(query: Query) -> Tensor:
     """The non-paraxial PSF, (Z, L, H, W) in the query's dtype, computed in float64; slow by design.
 
-    Raises: ValueError where doubling its own sampling changes it by more than 1e-7 (smooth pupils) or 3e-4 (maps of
-            flat pixels) of the mean light, so that it is no reference. Not checked while gradients are recorded.
+    Raises: ValueError as `checked_psf`. Not checked while gradients are recorded.
     """
-    answer = _evaluate(_refined(query), doubling=1).to(query.dtype)
-    measured = None if answer.requires_grad else convergence(query)
-    if measured is not None and not measured.reached:
+    answer = _evaluate(_refined(query), doubling=1)
+    return (answer if answer.requires_grad else checked_psf(query, answer)[0]).to(query.dtype)
+
+
+def checked_psf(query: Query, answer: Tensor | None = None) -> tuple[Tensor, Convergence]:
+    """The reference's PSF in float64, and how well it is converged.
+
+    Args:   answer: the PSF if it was computed already.
+    Raises: ValueError where doubling its own sampling changes it by more than 1e-7 (smooth pupils) or 3e-4 (maps of
+            flat pixels) of the mean light, so that it is no reference.
+    """
+    measured = convergence(query)
+    if not measured.reached:
         raise ValueError(
             f"the reference is not converged here: twice its sampling changes it by {measured.doubled:.1e}, a closed "
             f"form by {measured.closed_form:.1e} of the light (at most {measured.limit:.0e}). Use a smaller shape, or "
             "distances nearer to the focus, so that the default sampling suffices."
         )
-    return answer
+    return _evaluate(_refined(query), doubling=1) if answer is None else answer, measured
 
 
 def _refined(query: Query) -> Query:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from kcam import optics, sensor
+from kcam import Camera, optics, sensor
 from kcam.context import Context
+from kcam.optics.propagation import Propagator, choose
+from kcam.optics.psf import Query
 from kcam.scene import Scene
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -521,11 +525,7 @@ def test_a_window_is_never_larger_than_the_picture_and_always_odd() -> None:
 
 def fresh(stage: optics.Imaging) -> optics.Imaging:
     """A new stage with the same optics and nothing kept."""
-    names = (
-        "pixel_pitch", "propagator", "method", "samples", "psf_shape", "layers", "border", "fill_factor", "distance",
-    )  # fmt: skip
-    new = optics.Imaging(copy.deepcopy(stage.lens), **{name: getattr(stage, name) for name in names})
-    return new
+    return stage.changed(lens=copy.deepcopy(stage.lens))
 
 
 def change_data(stage: optics.Imaging) -> None:
@@ -576,6 +576,14 @@ def change_the_samples(stage: optics.Imaging) -> None:
     stage.samples = 40  # coarse: kappa 1.5 in this window
 
 
+def change_the_integration(stage: optics.Imaging) -> None:
+    stage.integrate = False
+
+
+def change_the_number_of_psfs(stage: optics.Imaging) -> None:
+    stage.bands = 2
+
+
 def change_the_elements(stage: optics.Imaging) -> None:
     stage.lens.elements.append(optics.Defocus(0.4))
 
@@ -588,7 +596,7 @@ SCENE = cube(size=(24, 24), bands=4, depth=1.2)
 CHANGES = [
     change_data, change_one_pixel, change_by_a_step, change_by_loading, change_a_float, change_the_glass,
     change_the_sensor, change_the_pitch, change_the_physics, change_the_fill_factor, change_the_elements,
-    change_the_levels, change_the_samples,
+    change_the_levels, change_the_samples, change_the_integration, change_the_number_of_psfs,
 ]  # fmt: skip
 
 
@@ -683,6 +691,80 @@ def test_keeping_saves_the_second_call() -> None:
     assert counts[2] == counts[1]
 
 
+# ---- what trades accuracy for time ---------------------------------------------------------------------------------
+
+
+def test_fewer_psfs_than_bands_are_those_of_their_groups() -> None:
+    order = torch.tensor([3, 0, 4, 1, 2])  # groups are neighbours in wavelength, not in the scene's order
+    scene = cube(depth=1.5)
+    shuffled = replace(scene, coefficients=scene.coefficients[:, order], wavelengths=scene.wavelengths[order])
+    few, each = imaging(rough_doe(), bands=2, psf_shape=(15, 15)), imaging(rough_doe(), psf_shape=(15, 15))
+    means = torch.stack([scene.wavelengths[:3].mean(), scene.wavelengths[3:].mean()])
+    psfs = each.psf_bank(means, vergences=torch.tensor([1 / 1.5]), shape=(15, 15), like=scene.coefficients)
+    bank = few.psf_bank(
+        shuffled.wavelengths, vergences=torch.tensor([1 / 1.5]), shape=(15, 15), like=scene.coefficients
+    )
+    assert torch.equal(bank, psfs[:, (order >= 3).long()])
+    assert relative(few(shuffled), few(scene)[:, order]) < 1e-13
+    errors = []
+    for bands in (1, 2, 4, 5, 99):
+        few.bands = bands
+        errors.append(relative(few(scene), each(scene)))
+    assert errors[0] > errors[1] > errors[2] > 1e-4
+    assert errors[3:] == [0, 0]  # every band has its own again
+
+
+def test_without_interpolation_each_pixel_is_in_its_nearest_layer() -> None:
+    ends = torch.tensor([0.5, 1.0], dtype=torch.float64)  # of the vergence; 0.7 is nearer to the first
+    depth = 1 / torch.tensor([0.5, 1.0, 0.7, 0.9], dtype=torch.float64).expand(1, 1, 40, 4)
+    rounded = 1 / ends[torch.tensor([0, 1, 0, 1])].expand(1, 1, 40, 4)
+    stage = imaging(layers=2, interpolate=False, psf_shape=(15, 15))
+    scene = cube(size=(40, 4), bands=3, depth=depth)
+    assert relative(stage(scene), stage(scene.with_depth(rounded))) < 1e-13
+    stage.interpolate = True
+    assert relative(stage(scene), stage(scene.with_depth(rounded))) > 1e-3
+
+
+def test_point_samples_on_request() -> None:
+    scene = cube(depth=1.5, bands=3)
+    points = imaging(integrate=False, psf_shape=(15, 15))
+    arguments = {"distances": 1.5, "pixel_pitch": PITCH, "shape": (15, 15), "dtype": torch.float64}
+    vergences = torch.tensor([1 / 1.5], dtype=torch.float64)
+    bank = points.psf_bank(scene.wavelengths, vergences=vergences, shape=(15, 15), like=scene.coefficients)
+    assert relative(bank, points.lens.psf(scene.wavelengths, integrate=False, **arguments)) < 1e-12
+    assert relative(points(scene), imaging(psf_shape=(15, 15))(scene)) > 1e-3
+
+
+def test_a_propagator_of_ones_own() -> None:
+    def spread(query: Query) -> Tensor:
+        count = query.shape[0] * query.shape[1]
+        return torch.full((len(query.vergences), len(query.wavelengths), *query.shape), 1 / count, dtype=query.dtype)
+
+    row = Propagator("flat", "none", function=spread, error=lambda q: 0, cost=lambda q: 0, valid=lambda q: None)
+    stage = imaging(propagator=row, psf_shape=(3, 3), border="zero")
+    scene = cube(depth=1.5, bands=2)
+    assert relative(stage(scene), F.avg_pool2d(scene.bands(), 3, 1, 1)) < 1e-13
+    assert choose(stage._query(scene.wavelengths, torch.ones(1), (3, 3), scene.coefficients), propagator=row) is row
+
+
+def test_a_changed_stage_differs_in_what_was_named() -> None:
+    stage = imaging(bands=3, layers=2, border="zero")
+    changed = stage.changed(bands=None, psf_shape=(9, 9))
+    assert (changed.bands, changed.psf_shape, changed.layers, changed.border) == (None, (9, 9), 2, "zero")
+    assert changed.lens is stage.lens
+    assert (stage.bands, stage.psf_shape) == (3, None)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'band'"):
+        stage.changed(band=3)
+
+
+def test_what_trades_accuracy_for_time_is_saved(tmp_path: Path) -> None:
+    stage = imaging(bands=7, interpolate=False, integrate=False, layers=3, samples=64, psf_shape=(9, 9))
+    Camera(stage).save(tmp_path / "camera.safetensors")
+    loaded = Camera.load(tmp_path / "camera.safetensors")[0]
+    for name in ("bands", "interpolate", "integrate", "layers", "samples", "psf_shape"):
+        assert getattr(loaded, name) == getattr(stage, name)
+
+
 # ---- bad input ---------------------------------------------------------------------------------------------------
 
 BAD = [
@@ -696,6 +778,7 @@ BAD = [
         r"unknown border 'mirror'; known: reflect, replicate, periodic, zero",
     ),
     (lambda: imaging(layers=0), ValueError, r"layers must be a positive number of depth layers, or None, got 0"),
+    (lambda: imaging(bands=0), ValueError, r"bands must be a positive number of wavelengths, or None for all, got 0"),
     (lambda: imaging(distance=-1.0), ValueError, r"distance -1 is not a distance in front of the lens"),
     (lambda: imaging(max_memory=0), ValueError, r"max_memory must be a positive number of bytes, got 0"),
     (lambda: imaging(fill_factor=0.0), ValueError, r"fill_factor 0 must be in \(0, 1\]"),
