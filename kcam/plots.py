@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
-from kcam import optics, sensor, spectral
+from kcam import files, optics, sensor, spectral
 from kcam.sensor.mosaic import pattern_tile
 from kcam.units import nm, um
 
@@ -28,30 +29,54 @@ FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
 
 
 def check_writable(path: str | os.PathLike[str], *, suffixes: Sequence[str] = PICTURE_SUFFIXES) -> None:
-    """Fail before the work and not after it: ValueError for a suffix that cannot be written, or a missing folder."""
+    """Fail before the work and not after it: ValueError for a suffix that cannot be written, or no place for it."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"cannot write {path.name}: its name must end in one of {', '.join(suffixes)}.")
+    if path.is_dir():
+        raise ValueError(f"cannot write {path.name}: there is a folder of that name. Choose another name.")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"cannot write {path.name}: there is no folder {path.parent}.")
 
 
 def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int = 95) -> None:
-    """Write a picture (3,H,W) in [0,1] as 8 bits; the suffix names the format. Raises: as `check_writable`."""
+    """Write a picture (3,H,W) or (1,H,W) in [0,1] as 8 bits; the suffix names the format.
+
+    Highlights and colours a little outside are clipped; the file is whole or not there.
+
+    Raises:    as `check_writable`; TypeError, ValueError for another shape, NaN, or values beyond -1..2.
+    """
     check_writable(path)
-    pixels = (as_image(picture) * 255).round().astype(np.uint8)
-    options: dict[str, Any] = {"quality": quality} if Path(path).suffix.lower() in {".jpg", ".jpeg", ".webp"} else {}
-    Image.fromarray(pixels).save(path, **options)
+    image = as_image(picture)
+    low, high = (value.item() for value in picture.detach().aminmax())
+    if not (low >= -1 and high <= 2):
+        fix = "Remove the NaNs." if low != low else "Use picture / 255, or picture.clamp(0, 1)."
+        raise ValueError(f"picture has values from {low:g} to {high:g}, expected [0,1]. {fix}")
+    suffix = Path(path).suffix.lower()
+    options: dict[str, Any] = {"quality": quality} if suffix in {".jpg", ".jpeg", ".webp"} else {}
+    content = io.BytesIO()
+    pixels = Image.fromarray((image * 255).round().astype(np.uint8))
+    pixels.save(content, format=Image.registered_extensions()[suffix], **options)
+    files.replace(path, content.getvalue())
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, resolution: float = 144) -> None:
     """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`."""
     check_writable(path, suffixes=FIGURE_SUFFIXES)
-    figure.savefig(path, dpi=resolution, facecolor="white")
+    content = io.BytesIO()
+    figure.savefig(content, dpi=resolution, facecolor="white", format=Path(path).suffix.lower()[1:])
+    files.replace(path, content.getvalue())
 
 
 def as_image(picture: Tensor) -> np.ndarray:
-    """A picture (C,H,W), C = 1 or 3, as an array (H,W,3) in [0,1]."""
+    """A picture (C,H,W), C = 1 or 3, as an array (H,W,3) in [0,1]. Raises: TypeError, ValueError for what is none."""
+    if not isinstance(picture, Tensor):
+        raise TypeError(f"a picture is a tensor (3,H,W) in [0,1], got {type(picture).__name__}.")
+    if picture.ndim != 3 or picture.shape[0] not in (1, 3) or 0 in picture.shape:
+        hint = {2: " Use picture[None].", 4: " Use picture[0]."}.get(picture.ndim, "")
+        if picture.ndim == 3 and picture.shape[-1] in (1, 3):
+            hint = " Use picture.permute(2, 0, 1)."
+        raise ValueError(f"a picture has shape (3,H,W) or (1,H,W), got {tuple(picture.shape)}.{hint}")
     image = picture.detach().float().clamp(0, 1).cpu().nan_to_num()
     return image.expand(3, -1, -1).permute(1, 2, 0).numpy()
 
