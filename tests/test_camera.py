@@ -154,6 +154,19 @@ def test_no_scene(scene: Any) -> None:
         Camera(Probe())(scene)
 
 
+def test_no_generator() -> None:
+    with pytest.raises(TypeError, match=r"generator must be a torch.Generator, got 3. Use torch.Generator\("):
+        Camera(Probe())(torch.zeros(1, 28, 4, 4), generator=3)  # type: ignore[arg-type]
+
+
+def test_a_camera_prints_its_values() -> None:
+    text = str(Camera.phone())
+    for part in ("ThinLens(focal_length=0.0043)", "ReadNoise(sigma_electrons=2)", "ADC(bits=10, black_level=64)"):
+        assert part in text
+    assert "ShotNoise(full_well=(2, 1, 1, 1))" in str(sensor.ShotNoise(torch.ones(2, 1, 1, 1)))
+    assert str(Probe()) == "Probe()"
+
+
 def test_sequence() -> None:
     camera = full_camera()
     assert len(camera) == 11
