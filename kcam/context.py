@@ -56,8 +56,9 @@ def arguments_text(module: nn.Module) -> str:
 
     Modules among them print themselves, and what was left open is left out.
     """
-    if hasattr(module, "configuration"):
-        held = module.configuration()
+    configuration: Any = getattr(module, "configuration", None)
+    if callable(configuration):
+        held = configuration()
     else:
         held = vars(module) | dict(module.named_buffers(recurse=False)) | dict(module.named_parameters(recurse=False))
     shown = []
