@@ -87,7 +87,7 @@ def run(
                 rows[-1].append(picture[0])
                 figure = plots.pipeline_figure(
                     scene=rows[-1][0],
-                    raw=raw[0],
+                    raw=raw[0] - camera.resolve().black_level,
                     picture=picture[0],
                     tile=plots.mosaic_tile(camera),
                     times=times,

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
@@ -265,6 +267,57 @@ def test_light_has_its_colour() -> None:
     assert blue.argmax() == 2
     assert green.argmax() == 1
     assert red.argmax() == 0
+
+
+def test_light_that_nobody_sees_is_white() -> None:
+    assert plots.light_colours(torch.tensor([5500.0]) * nm).tolist() == [[1, 1, 1]]
+
+
+@pytest.mark.parametrize("distances", [[1.0], [0.5, 2.0, math.inf]])
+@pytest.mark.parametrize("wavelengths", [[550 * nm], [450 * nm, 650 * nm, 5500 * nm]])
+def test_all_text_of_a_psf_figure_is_inside_it(distances: list[float], wavelengths: list[float]) -> None:
+    imaging = Camera.phone()[0]
+    with torch.no_grad():
+        figure = plots.psf_figure(imaging, distances=distances, wavelengths=wavelengths, title="phone camera")
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    boxes = [text.get_window_extent(canvas.get_renderer()) for text in figure.texts]
+    boxes += [axes.get_tightbbox(canvas.get_renderer()) for axes in figure.axes]
+    for box in boxes:
+        assert min(box.x0, box.y0) >= 0
+        assert box.x1 <= figure.bbox.x1
+        assert box.y1 <= figure.bbox.y1
+    # the light within a radius is a smooth curve: no corner of more than 10 degrees as drawn, 4.2 by 1.8 inches
+    line = figure.axes[-1].lines[0]
+    steps = np.diff(figure.axes[-1].transData.transform(line.get_xydata()), axis=0)
+    assert np.degrees(np.abs(np.diff(np.arctan2(steps[:, 1], steps[:, 0])))).max() < 10
+
+
+@pytest.mark.parametrize("count", [1, 6, 7, 10, 20])
+def test_no_two_curves_are_alike(count: int) -> None:
+    colours = np.array([to_rgb(colour) for colour in plots.distance_colours(count)])
+    apart = np.abs(colours[:, None] - colours).max(-1) + np.eye(count)
+    assert apart.min() > 0.05
+
+
+def test_raw_is_shown_bright_and_black_is_black(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gray wall at 0.3 of the well beside black, in RGGB: its mean over a tile was a dark quarter of red and blue."""
+    shown: list[np.ndarray] = []
+    draw = plots.Sheet.picture
+
+    def picture_of(sheet: plots.Sheet, image: np.ndarray, *where: float, **style: bool) -> Any:
+        shown.append(image)
+        return draw(sheet, image, *where, **style)
+
+    monkeypatch.setattr(plots.Sheet, "picture", picture_of)
+    raw = 0.3 * (torch.arange(80) >= 40).float().expand(1, 60, 80)
+    picture = torch.zeros(3, 60, 80)
+    tile = plots.mosaic_tile(Camera.phone())
+    times = [("ADC", 0.1)]
+    plots.pipeline_figure(scene=picture, raw=raw, picture=picture, tile=tile, times=times, title="t", subtitle="s")
+    panel = next(image for image in shown if image.max() > 0.9)
+    assert panel[:, 60].max() > 0.95
+    assert panel[:, 20].max() == 0
 
 
 def test_durations() -> None:
