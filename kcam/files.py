@@ -48,7 +48,8 @@ def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[st
     """
     path = Path(path)
     if path.suffix != ".safetensors":
-        raise ValueError(f"cannot save {path.name}: its name must end in .safetensors. Use {path.stem}.safetensors.")
+        better = f"{path.stem.removesuffix('.safetensors')}.safetensors"
+        raise ValueError(f"cannot save {path.name}: its name must end in .safetensors. Use {better}.")
     if path.is_dir():
         raise ValueError(f"cannot save {path.name}: there is a folder of that name. Choose another name.")
     if not path.parent.is_dir():

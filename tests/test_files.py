@@ -204,7 +204,7 @@ def test_cannot_save(module: nn.Module, message: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["x", "x.pt", "x.safetensors.bak"])
 def test_name_must_say_what_it_is(name: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=f"cannot save {name}: its name must end in .safetensors, such as x"):
+    with pytest.raises(ValueError, match=f"cannot save {name}: its name must end in .safetensors. Use x.safetensors.$"):
         store(Gain(1.0), tmp_path / name)
     assert not list(tmp_path.iterdir())
 
