@@ -69,9 +69,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="a figure of the PSFs before and after, such as doe.png")
     options = parser.parse_args(arguments)
     before, after, losses = train(options.steps)
-    for step in range(0, len(losses), max(1, len(losses) // 6)):
+    last = len(losses) - 1
+    for step in sorted({*range(0, last, max(1, len(losses) // 6)), last}):
         print(f"step {step:3d}   loss {losses[step]:.4f}")
-    print(f"step {len(losses) - 1:3d}   loss {losses[-1]:.4f}")
     print("\nlight in the central 3 x 3 pixels")
     old, new = light_in_the_middle(before), light_in_the_middle(after)
     for index, distance in enumerate(DISTANCES.tolist()):

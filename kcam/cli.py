@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from kcam import __version__
 
 if TYPE_CHECKING:
+    from kcam import optics
     from kcam.camera import Camera
     from kcam.scene import Scene
 
@@ -22,32 +24,44 @@ UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
+SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="of the noise")]
 CameraOption = Annotated[
     str, typer.Option("--camera", help="thesis, ideal, phone, singlet, or a file that Camera.save wrote")
 ]
 
 
-def length(text: str, *, unit: str = "m", name: str = "distance") -> float:
+def length(
+    text: str, *, unit: str = "m", name: str = "distance", expected: str = '2, "50 cm" or inf', least: float = 0.0,
+    most: float = math.inf,
+) -> float:
     """A length in metres from text such as "2", "2 m", "50cm", "550 nm" or "inf".
 
     Args:      unit: what a bare number is in.
-               name: what to call it in an error.
+               name: what to call it in an error.  expected: an example for the error.
+               least, most: the range that makes sense [m].
     Raises:    ValueError for anything else.
     """
     match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)\s*([a-zµ]*)\s*", text.lower())
     if not match or match[2] not in {"", *UNITS}:
-        raise ValueError(f'{name} "{text}" is not a length: expected e.g. 2, "50 cm" or inf ({", ".join(UNITS)}).')
-    return float(match[1]) * UNITS[match[2] or unit]
+        raise ValueError(f'{name} "{text}" is not a length: expected e.g. {expected} ({", ".join(UNITS)}).')
+    metres = float(match[1]) * UNITS[match[2] or unit]
+    if not least <= metres <= most:
+        bare = "" if match[2] else f" A number without a unit is in {unit}."
+        raise ValueError(f'{name} "{text}" is outside {least:g} m to {most:g} m.{bare} Expected e.g. {expected}.')
+    return metres
 
 
-def lengths(text: str, *, unit: str, name: str) -> list[float]:
+def lengths(
+    text: str, *, unit: str, name: str, expected: str = "1, 2, inf", least: float = 0.0, most: float = math.inf
+) -> list[float]:
     """Lengths in metres from text such as "1, 2, inf" or "450,550,650 nm": a unit at the end holds for all."""
+    expected = f'"{expected}" with commas'
     items = [item for item in text.split(",") if item.strip()]
     last = re.search(r"[a-zµ]+\s*$", items[-1].lower()) if items else None
     shared = last[0].strip() if last and last[0].strip() in UNITS else unit
     if not items:
-        raise ValueError(f'{name} "{text}" is empty: expected e.g. "1, 2, inf".')
-    return [length(item, unit=shared, name=name) for item in items]
+        raise ValueError(f'{name} "{text}" is empty: expected e.g. {expected}.')
+    return [length(item, unit=shared, name=name, expected=expected, least=least, most=most) for item in items]
 
 
 def open_camera(name: str) -> Camera:
@@ -76,6 +90,28 @@ def open_scene(name: str, *, size: int) -> Scene:
     if Path(name).suffix or Path(name).exists():
         return Scene.from_file(name).resized(size)
     raise ValueError(f'unknown scene "{name}": expected one of {", ".join(BUILTIN)}, or a picture file.')
+
+
+def check_not_too_near(imaging: optics.Imaging, distance: float, *, shape: tuple[int, int]) -> None:
+    """ValueError for a distance at which a point's blur is wider than the picture: its light would be lost.
+
+    The blur is the shadow of the aperture, D d (1 / z - 1 / z_focus) wide; inside the focal length no image is real.
+    """
+    lens = imaging.lens
+    width = 2 * float(lens.aperture.semi_aperture().detach())
+    per_vergence = width * float(lens.sensor_distance) / imaging.pixel_pitch  # pixels per 1/m
+    side = min(*shape, *(imaging.psf_shape or ()))
+    focus = 1 / lens.focus_distance
+    focal_length = float(lens.focal_length())
+    nearest = max(1 / (focus + side / per_vergence), focal_length)
+    if distance <= nearest:
+        blur = per_vergence * (1 / distance - focus)
+        reason = f"a point there blurs over {blur:.0f} pixels, of which there are {side}"
+        if distance <= focal_length:
+            reason = f"it is inside the focal length of {focal_length * 1e3:.3g} mm, where nothing has an image"
+        raise ValueError(
+            f'distance {distance:g} m is too near: {reason}. Use --distance "{math.ceil(nearest * 101)} cm" or more.'
+        )
 
 
 @contextmanager
@@ -120,7 +156,7 @@ def options(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", help="folder for the pictures")] = Path("demo"),
-    seed: Annotated[int, typer.Option("--seed", help="of the noise")] = 0,
+    seed: SeedOption = 0,
 ) -> None:
     """Photograph the built-in scenes with two cameras; write the pictures, the raws and the PSFs as figures."""
     with one_line_errors():
@@ -136,27 +172,32 @@ def demo(
 def shoot(
     photo: Annotated[Path, typer.Argument(help="a picture: PNG, JPEG, TIFF, ... of 8 or 16 bits")],
     camera: CameraOption = "phone",
-    distance: Annotated[str, typer.Option("--distance", help='of the scene: 2, "50 cm", inf')] = "2 m",
+    distance: Annotated[str, typer.Option("--distance", help='of the scene, in metres: 2, "50 cm", inf')] = "2 m",
     out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("shot.png"),
-    seed: Annotated[int, typer.Option("--seed", help="of the noise")] = 0,
+    seed: SeedOption = 0,
 ) -> None:
     """Photograph a photograph: what this camera would have seen at that distance. The picture keeps its size."""
     with one_line_errors():
         import torch
 
-        from kcam import plots
+        from kcam import optics, plots
         from kcam.scene import Scene
 
         plots.check_writable(out)
+        if out.exists() and photo.exists() and out.samefile(photo):
+            raise ValueError(f"{out} is the photo itself, which would be lost. Choose another name for --out.")
         stages = open_camera(camera)
         scene = Scene.from_file(photo, depth=length(distance))
+        for stage in stages:
+            if isinstance(stage, optics.Imaging):
+                check_not_too_near(stage, length(distance), shape=scene.shape[1:])
         generator = torch.Generator().manual_seed(seed)
         with torch.no_grad(), progress("shoot", total=len(stages)) as advance:
             for name, picture in stages.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
                 advance(name)
         if picture.shape[1] != 3:
             raise ValueError(f"camera {camera} gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
-        plots.write_picture(picture[0], out)
+        plots.write_picture(picture[0].clamp(0, 1), out)
         typer.echo(out)
 
 
@@ -164,16 +205,20 @@ def shoot(
 def psf(
     camera: CameraOption = "thesis",
     out: Annotated[Path, typer.Option("--out", help="the figure to write: .png, .pdf or .svg")] = Path("psf.png"),
-    distances: Annotated[str, typer.Option("--distances", help='of the point: "0.5, 2, inf" [m]')] = "",
-    wavelengths: Annotated[str, typer.Option("--wavelengths", help='of its light: "450, 550, 650" [nm]')] = "",
+    distances: Annotated[str, typer.Option("--distances", help='of the point, in metres: "0.5, 2, inf"')] = "",
+    wavelengths: Annotated[
+        str, typer.Option("--wavelengths", help='of its light, in nanometres: "450, 550, 650"')
+    ] = "",
 ) -> None:
     """Draw a camera's PSFs over wavelength and distance, its MTF, and its encircled energy."""
     with one_line_errors():
         import torch
 
         from kcam import optics, plots
+        from kcam.units import WAVELENGTH_RANGE
 
-        plots.check_writable(out)
+        plots.check_writable(out, suffixes=plots.FIGURE_SUFFIXES)
+        least, most = WAVELENGTH_RANGE
         imaging = next((stage for stage in open_camera(camera) if isinstance(stage, optics.Imaging)), None)
         if imaging is None:
             raise ValueError(f"camera {camera} has no lens, so it has no PSF. Try --camera thesis or phone.")
@@ -181,7 +226,11 @@ def psf(
             figure = plots.psf_figure(
                 imaging,
                 distances=lengths(distances, unit="m", name="distances") if distances else None,
-                wavelengths=lengths(wavelengths, unit="nm", name="wavelengths") if wavelengths else None,
+                wavelengths=lengths(
+                    wavelengths, unit="nm", name="wavelengths", expected="450, 550, 650", least=least, most=most
+                )
+                if wavelengths
+                else None,
                 title=f"{Path(camera).stem} camera",
             )
         plots.save_figure(figure, out)

@@ -6,6 +6,7 @@ that its stages provide when it is built, and those that the scene provides at e
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -50,8 +51,35 @@ class Context:
     black_level: float = 0.0
 
 
+def arguments_text(module: nn.Module) -> str:
+    """The constructor arguments that a module holds, as ``print`` shows them: a tensor of many values by its shape.
+
+    Modules among them print themselves, and what was left open is left out.
+    """
+    configuration: Any = getattr(module, "configuration", None)
+    if callable(configuration):
+        held = configuration()
+    else:
+        held = vars(module) | dict(module.named_buffers(recurse=False)) | dict(module.named_parameters(recurse=False))
+    shown = []
+    for name in inspect.signature(type(module)).parameters:
+        value = held.get(name)
+        if isinstance(value, Tensor):
+            value = f"{value.item():g}" if value.numel() == 1 else tuple(value.shape)
+            shown.append(f"{name}={value}")
+        elif isinstance(value, (bool, int, str, tuple)):
+            shown.append(f"{name}={value!r}")
+        elif isinstance(value, float):
+            shown.append(f"{name}={value:g}")
+    return ", ".join(shown)
+
+
 class Stage(nn.Module):
     """A module from tensor to tensor that may read a `Context`: ``stage(signal)`` or ``stage(signal, context)``."""
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        return arguments_text(self)
 
     def provides(self) -> dict[str, Any]:
         """The `Context` fields that this stage determines for its neighbours (arguments left open are left out)."""

@@ -66,9 +66,13 @@ def run(
                size: longer side of the scenes [pixels]; None for their own.
                advance: called after each of `STEPS` steps with what was done.
     Returns:   the files written: an overview, a figure per scene and camera, a PSF figure per camera, and the pictures.
+    Raises:    ValueError if a file stands where the folder should.
     """
     out = Path(out)
-    (out / "pictures").mkdir(parents=True, exist_ok=True)
+    try:
+        (out / "pictures").mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ValueError(f"cannot make the folder {out}: there is a file in its place. Choose a folder.") from error
     advance = advance or (lambda what: None)
     cameras = {name: make() for name, (_, make) in CAMERAS.items()}
     paths, rows = [], []
@@ -83,7 +87,7 @@ def run(
                 rows[-1].append(picture[0])
                 figure = plots.pipeline_figure(
                     scene=rows[-1][0],
-                    raw=raw[0],
+                    raw=raw[0] - camera.resolve().black_level,
                     picture=picture[0],
                     tile=plots.mosaic_tile(camera),
                     times=times,

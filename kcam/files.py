@@ -43,9 +43,15 @@ def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[st
                reader must hand it in.
                version: of kcam, for the reader's information.
     Raises:    TypeError for an argument that cannot be written or that its class does not keep;
+               ValueError for a name that does not end in .safetensors, or is a folder's;
                FileNotFoundError if the folder does not exist.
     """
     path = Path(path)
+    if path.suffix != ".safetensors":
+        better = f"{path.stem.removesuffix('.safetensors')}.safetensors"
+        raise ValueError(f"cannot save {path.name}: its name must end in .safetensors. Use {better}.")
+    if path.is_dir():
+        raise ValueError(f"cannot save {path.name}: there is a folder of that name. Choose another name.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot save {path.name}: there is no folder {path.parent}.")
     writer = _Writer({cls: name for name, cls in classes.items()})
@@ -60,7 +66,7 @@ def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[st
         "state": list(aliases),
     }
     tensors = {key: tensor.detach().cpu().clone().contiguous() for key, tensor in writer.tensors.items()}
-    _replace(path, to_bytes(tensors, metadata={"kcam": json.dumps(document, indent=1)}))
+    replace(path, to_bytes(tensors, metadata={"kcam": json.dumps(document, indent=1)}))
 
 
 def load(path: str | os.PathLike[str], *, classes: Mapping[str, type]) -> Any:
@@ -228,7 +234,8 @@ def _join(path: str, name: str | int) -> str:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The configuration and the tensors in a file; the tensors do not depend on the file any more."""
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}.")
+        what = f"{path} is a folder. Name the file in it" if path.is_dir() else f"there is no file {path}"
+        raise FileNotFoundError(f"{what}.")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -246,8 +253,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return document, tensors
 
 
-def _replace(path: Path, content: bytes) -> None:
+def replace(path: str | os.PathLike[str], content: bytes) -> None:
     """Write beside the file, then take its place: a crash or a full disk leaves the old file whole."""
+    path = Path(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:

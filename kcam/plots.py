@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections.abc import Sequence
@@ -15,10 +16,11 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 from torch.nn import functional as F
 
-from kcam import optics, sensor, spectral
+from kcam import files, optics, sensor, spectral
 from kcam.sensor.mosaic import pattern_tile
 from kcam.tradeoff import Row, Sweep, front
 from kcam.units import nm, um
@@ -31,38 +33,67 @@ FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
 
 
 def check_writable(path: str | os.PathLike[str], *, suffixes: Sequence[str] = PICTURE_SUFFIXES) -> None:
-    """Fail before the work and not after it: ValueError for a suffix that cannot be written, or a missing folder."""
+    """Fail before the work and not after it: ValueError for a suffix that cannot be written, or no place for it."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"cannot write {path.name}: its name must end in one of {', '.join(suffixes)}.")
+    if path.is_dir():
+        raise ValueError(f"cannot write {path.name}: there is a folder of that name. Choose another name.")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"cannot write {path.name}: there is no folder {path.parent}.")
 
 
 def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int = 95) -> None:
-    """Write a picture (3,H,W) in [0,1] as 8 bits; the suffix names the format. Raises: as `check_writable`."""
+    """Write a picture (3,H,W) or (1,H,W) in [0,1] as 8 bits; the suffix names the format.
+
+    Highlights and colours a little outside are clipped; the file is whole or not there.
+
+    Raises:    as `check_writable`; TypeError, ValueError for another shape, NaN, or values beyond -1..2.
+    """
     check_writable(path)
-    pixels = (as_image(picture) * 255).round().astype(np.uint8)
-    options: dict[str, Any] = {"quality": quality} if Path(path).suffix.lower() in {".jpg", ".jpeg", ".webp"} else {}
-    Image.fromarray(pixels).save(path, **options)
+    image = as_image(picture)
+    low, high = (value.item() for value in picture.detach().aminmax())
+    if not (low >= -1 and high <= 2):
+        fix = "Remove the NaNs." if low != low else "Use picture / 255, or picture.clamp(0, 1)."
+        raise ValueError(f"picture has values from {low:g} to {high:g}, expected [0,1]. {fix}")
+    suffix = Path(path).suffix.lower()
+    options: dict[str, Any] = {"quality": quality} if suffix in {".jpg", ".jpeg", ".webp"} else {}
+    content = io.BytesIO()
+    pixels = Image.fromarray((image * 255).round().astype(np.uint8))
+    pixels.save(content, format=Image.registered_extensions()[suffix], **options)
+    files.replace(path, content.getvalue())
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, resolution: float = 144) -> None:
     """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`."""
     check_writable(path, suffixes=FIGURE_SUFFIXES)
-    figure.savefig(path, dpi=resolution, facecolor="white")
+    content = io.BytesIO()
+    figure.savefig(content, dpi=resolution, facecolor="white", format=Path(path).suffix.lower()[1:])
+    files.replace(path, content.getvalue())
 
 
 def as_image(picture: Tensor) -> np.ndarray:
-    """A picture (C,H,W), C = 1 or 3, as an array (H,W,3) in [0,1]."""
+    """A picture (C,H,W), C = 1 or 3, as an array (H,W,3) in [0,1]. Raises: TypeError, ValueError for what is none."""
+    if not isinstance(picture, Tensor):
+        raise TypeError(f"a picture is a tensor (3,H,W) in [0,1], got {type(picture).__name__}.")
+    if picture.ndim != 3 or picture.shape[0] not in (1, 3) or 0 in picture.shape:
+        hint = {2: " Use picture[None].", 4: " Use picture[0]."}.get(picture.ndim, "")
+        if picture.ndim == 3 and picture.shape[-1] in (1, 3):
+            hint = " Use picture.permute(2, 0, 1)."
+        raise ValueError(f"a picture has shape (3,H,W) or (1,H,W), got {tuple(picture.shape)}.{hint}")
     image = picture.detach().float().clamp(0, 1).cpu().nan_to_num()
     return image.expand(3, -1, -1).permute(1, 2, 0).numpy()
 
 
 def light_colours(wavelengths: Tensor) -> np.ndarray:
-    """A colour for each wavelength, (L,3) sRGB in [0,1]: as the CIE 1931 observer sees it, as pure as a screen can."""
-    linear = spectral.observer(wavelengths).double() @ spectral.xyz_to_srgb_matrix().T
-    return _pure(linear - linear.amin(-1, keepdim=True).clamp(max=0))  # the least white that makes it a real colour
+    """A colour for each wavelength, (L,3) sRGB in [0,1]: as the CIE 1931 observer sees it, as pure as a screen can.
+
+    Light that nobody sees is white.
+    """
+    seen = spectral.observer(wavelengths).double()
+    linear = seen @ spectral.xyz_to_srgb_matrix().T
+    linear = linear - linear.amin(-1, keepdim=True).clamp(max=0)  # the least white that makes it a real colour
+    return _pure(torch.where(seen.sum(-1, keepdim=True) > 0, linear, 1.0))
 
 
 def _pure(linear: Tensor) -> np.ndarray:
@@ -135,14 +166,14 @@ def pipeline_figure(
 ) -> Figure:
     """From scene to picture: both, the raw mosaic between them, a detail of each, and the time that each stage took.
 
-    Args:      scene, picture: (3,H,W) sRGB.  raw: (1,H,W).  tile: see `mosaic_tile`.
+    Args:      scene, picture: (3,H,W) sRGB.  raw: (1,H,W), its black level taken off.  tile: see `mosaic_tile`.
                times: (stage, seconds).
                zoom: centre of the detail as shares of the height and the width.  zoom_size: its width [pixels].
     """
     raw_colours = false_colour(raw, tile)
     panels = [
         ("Scene", as_image(scene)),
-        ("Raw, in the colours of its filters", _mixed(raw_colours, len(tile))),
+        ("Raw above black, in the filters' colours", _brightened(_mixed(raw_colours, len(tile)))),
         ("Picture", as_image(picture)),
     ]
     height, width = panels[0][1].shape[:2]
@@ -179,6 +210,11 @@ def _mixed(image: np.ndarray, tile: int) -> np.ndarray:
     return F.avg_pool2d(planes, width, stride=1).permute(1, 2, 0).numpy()
 
 
+def _brightened(image: np.ndarray) -> np.ndarray:
+    """Scaled so that all but its brightest hundredth keeps its colour: pixels of one colour are dark between others."""
+    return np.clip(image / max(float(np.quantile(image, 0.99)), 1e-6), 0, 1)
+
+
 def _time_bars(
     sheet: Sheet, times: Sequence[tuple[str, float]], *, left: float, top: float, width: float, height: float
 ) -> None:
@@ -203,6 +239,9 @@ def duration(seconds: float) -> str:
         return f"{seconds:.3g} s" if seconds < 100 else f"{seconds:.0f} s"
     return f"{seconds * 1e3:.0f} ms" if seconds >= 0.01 else f"{seconds * 1e3:.1f} ms"
 
+
+SHARE_SHOWN = 0.97
+"""Of the light of each PSF in its window: what the panels of a PSF figure hold at least."""
 
 CURVE_COLOURS = ("#c8553d", "#1c1c22", "#2a9d8f", "#3f6fd8", "#8f5fbf", "#b8860b")
 
@@ -236,33 +275,44 @@ def psf_figure(
         "method": imaging.method,
     }
     psf = lens.psf(colours_at, fill_factor=imaging.fill_factor, **arguments).detach().double().cpu()
-    reach = _reach(psf, share=0.97)
+    reach = _reach(psf, share=SHARE_SHOWN)
     window = {"shape": (2 * reach + 1, 2 * reach + 1)}
     daylight = lens.psf(bands, fill_factor=imaging.fill_factor, **(arguments | window)).detach().double().cpu()
     daylight = torch.einsum("dlhw,lc->dchw", daylight, spectral.xyz_weights(bands, "D65"))
     daylight = spectral.xyz_to_linear_srgb(daylight).clamp(min=0)
     lit = [light_colours(colours_at)[index] for index in range(len(colours_at))]
-    cell, gap, edge, head, rim = 1.3, 0.07, 0.4, 1.35, 0.75
+    cell, gap, edge, head, rim = 1.3, 0.07, 0.4, 1.6, 0.75
     columns = len(lit) + 1
-    plots_left = edge + rim + columns * (cell + gap) + 0.95
-    plots_width, grid_height = 4.2, len(distances) * (cell + gap) - gap
-    plot_height = max((grid_height - 0.85) / 2, 1.8)
-    sheet = Sheet(plots_left + plots_width + edge, head + max(grid_height, 2 * plot_height + 0.85) + 0.75)
+    grid_width, grid_height = rim + columns * (cell + gap), len(distances) * (cell + gap) - gap
+    beside = len(distances) > 2  # the curves stand beside a high grid and below a flat one
+    plots_left = edge + grid_width + 0.95 if beside else edge + rim
+    plots_top = head if beside else head + grid_height + 0.75
+    plot_width = 4.2 if beside else max((grid_width - rim - gap - 0.85) / 2, 3.2)
+    plot_height = max((grid_height - 0.85) / 2, 1.8) if beside else 2.2
+    step = (0.0, plot_height + 0.85) if beside else (plot_width + 0.85, 0.0)
+    sheet = Sheet(
+        plots_left + plot_width + step[0] + edge, max(head + grid_height, plots_top + plot_height + step[1]) + 0.75
+    )
     sheet.text(edge, 0.32, title, size=TITLE, weight="bold")
     sheet.text(
         edge,
         0.64,
         f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, in focus at {metres(focus)};  "
-        f"pixels of {pitch / um:.3g} \u00b5m;  each panel {2 * reach + 1} pixels wide, scaled to its own peak, "
-        "square root shown",
+        f"pixels of {pitch / um:.3g} \u00b5m\n"
+        f"Panels: the middle {2 * reach + 1} of {min(shape)} pixels, with {SHARE_SHOWN:.0%} or more of their light; "
+        "each scaled to its own peak, square root shown",
         colour=MUTED,
+        linespacing=1.4,
     )
+    curve_colours = distance_colours(len(distances))
     for column in range(columns):
         name = f"{colours_at[column] / nm:.0f} nm" if column < len(lit) else "daylight"
         sheet.text(edge + rim + column * (cell + gap) + cell / 2, head - 0.24, name, ha="center")
     for row, distance in enumerate(distances):
         top = head + row * (cell + gap)
-        sheet.text(edge + rim - 0.14, top + cell / 2, metres(distance), ha="right", va="center")
+        sheet.text(
+            edge + rim - 0.14, top + cell / 2, metres(distance), ha="right", va="center", colour=curve_colours[row]
+        )
         for column in range(columns):
             if column < len(lit):
                 image = _centre(psf[row, column], reach)[..., None].numpy() * lit[column] ** 2.2
@@ -272,17 +322,20 @@ def psf_figure(
             sheet.picture(image, edge + rim + column * (cell + gap), top, cell, cell, smooth=False)
     middle = colours_at[len(colours_at) // 2]
     contrast, energy = (
-        sheet.axes(plots_left, head + index * (plot_height + 0.85), plots_width, plot_height) for index in (0, 1)
+        sheet.axes(plots_left + index * step[0], plots_top + index * step[1], plot_width, plot_height)
+        for index in (0, 1)
     )
     frequencies, mtf = _mtf(imaging, arguments, wavelength=float(middle))
-    count = min(40, int(reach * pitch / (0.35 * um)))  # much finer than the light itself
+    count = min(40, int(reach * pitch / (0.2 * um)))  # much finer than the light itself
     radii = torch.linspace(0, reach * pitch, count + 1)
     disc = {"pixel_pitch": reach * pitch / count, "shape": (2 * count + 1, 2 * count + 1)}
     light = lens.encircled_energy(middle[None], **(arguments | disc))[:, 0].detach().cpu()
+    between = np.linspace(0, reach * pitch, 401)  # a monotone cubic through the radii: a few of them make corners
+    smooth = PchipInterpolator(radii.double().numpy(), light.double().numpy(), axis=1)(between)
     for index, distance in enumerate(distances):
-        style = {"color": CURVE_COLOURS[index % len(CURVE_COLOURS)], "lw": 1.6, "label": metres(distance)}
+        style = {"color": curve_colours[index], "lw": 1.6, "label": metres(distance)}
         contrast.plot(frequencies / 1e3, mtf[index], **style)
-        energy.plot(radii / um, light[index], **style)
+        energy.plot(between / um, smooth[index], **style)
     name = f"{middle / nm:.0f} nm"
     _finish(
         contrast,
@@ -290,9 +343,22 @@ def psf_figure(
         label="line pairs per mm, up to the pixels' limit",
         end=0.5 / pitch / 1e3,
     )
-    _finish(energy, title=f"Light within a radius, {name}", label="radius [\u00b5m]", end=reach * pitch / um)
-    contrast.legend(frameon=False, fontsize=SMALL, labelcolor=INK)
+    _finish(
+        energy,
+        title=f"Light within a radius, {name}",
+        label="radius [\u00b5m], up to the panels' edge",
+        end=reach * pitch / um,
+    )
+    contrast.legend(frameon=False, fontsize=SMALL, labelcolor=INK, ncols=1 if len(distances) <= 6 else 2)
     return sheet.figure
+
+
+def distance_colours(count: int) -> list[Any]:
+    """A colour for each of so many curves, no two alike: a few by name, more along a scale."""
+    if count <= len(CURVE_COLOURS):
+        return list(CURVE_COLOURS[:count])
+    scale = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, count))[:, :3]
+    return list(scale * 0.85)  # its yellow is too bright for text on white
 
 
 def _mtf(imaging: optics.Imaging, arguments: dict[str, Any], *, wavelength: float) -> tuple[Tensor, Tensor]:

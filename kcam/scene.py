@@ -325,7 +325,8 @@ def read_picture(path: str | os.PathLike[str]) -> Tensor:
 
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
+        what = f"{path} is a folder" if path.is_dir() else f"there is no file {path}"
+        raise FileNotFoundError(f"{what}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
     try:
         with Image.open(path) as file:
             if file.format in ("PNG", "TIFF") and ";16" in str(file.tile):
@@ -337,7 +338,12 @@ def read_picture(path: str | os.PathLike[str]) -> Tensor:
                 mode = ("L" if file.mode in ("1", "L", "LA") else "RGB") + "A" * file.has_transparency_data
                 pixels = torch.tensor(np.atleast_3d(np.asarray(file.convert(mode)))).permute(2, 0, 1) / 255
             orientation = file.getexif().get(0x0112, 1)  # after decoding: Pillow has turned a TIFF by then
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
+        raise ValueError(
+            f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, more than can be "
+            "photographed in one piece. Make it smaller first."
+        ) from error
+    except (OSError, ValueError, SyntaxError) as error:
         raise ValueError(f"cannot read {path} as a picture of 8 or 16 bits: {error}.") from error
     if len(pixels) in (2, 4):
         pixels, alpha = pixels[:-1], pixels[-1:]

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from skimage.color import deltaE_ciede2000, rgb2lab
 from torch import Tensor, nn
 
 import kcam
@@ -152,6 +153,19 @@ def test_bad_order() -> None:
 def test_no_scene(scene: Any) -> None:
     with pytest.raises(TypeError, match=r"a camera takes a Scene or a tensor \(B,L,H,W\), got .*Scene.from_rgb"):
         Camera(Probe())(scene)
+
+
+def test_no_generator() -> None:
+    with pytest.raises(TypeError, match=r"generator must be a torch.Generator, got 3. Use torch.Generator\("):
+        Camera(Probe())(torch.zeros(1, 28, 4, 4), generator=3)  # type: ignore[arg-type]
+
+
+def test_a_camera_prints_its_values() -> None:
+    text = str(Camera.phone())
+    for part in ("ThinLens(focal_length=0.0043)", "ReadNoise(sigma_electrons=2)", "ADC(bits=10, black_level=64)"):
+        assert part in text
+    assert "ShotNoise(full_well=(2, 1, 1, 1))" in str(sensor.ShotNoise(torch.ones(2, 1, 1, 1)))
+    assert str(Probe()) == "Probe()"
 
 
 def test_sequence() -> None:
@@ -303,6 +317,24 @@ def test_load_something_else(tmp_path: Path) -> None:
     kcam.camera.files.save(lens(), path, classes=kcam.camera._classes(), version="0")
     with pytest.raises(ValueError, match="holds a Lens, not a Camera"):
         Camera.load(path)
+
+
+def test_the_ideal_camera_has_its_filters_colours() -> None:
+    """What README says of it: 2.2 on coffee (2.15 at this size), nothing on gray."""
+    scene, gray = Scene.builtin("coffee", size=96), Scene.from_rgb(torch.full((3, 4, 4), 0.5))
+    with torch.no_grad():
+        picture, flat = Camera.ideal()(scene), Camera.ideal()(gray)
+    lab = [rgb2lab(image[0].permute(1, 2, 0).double().numpy()) for image in (scene.to_srgb(), picture)]
+    assert 1.9 < deltaE_ciede2000(*lab).mean() < 2.5
+    assert flat.amax() - flat.amin() < 1e-3  # rounding of the fitted matrix, a quarter of a step of 8 bits
+
+
+def test_the_thesis_starts_without_colour_but_a_cast_of_lilac() -> None:
+    scene = Scene.from_rgb(torch.full((3, 56, 56), 0.5), wavelengths=FEW)
+    with torch.no_grad():
+        red, green, blue = Camera.thesis()(scene)[0].mean((-2, -1)).tolist()
+    assert blue > red > green
+    assert blue - green < 0.1  # measured 0.03: a cast, no colour
 
 
 def test_unknown_preset() -> None:

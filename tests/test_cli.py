@@ -1,18 +1,23 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
 
 import kcam
-from kcam import Camera, cli, demo, plots
+from kcam import Camera, cli, demo, files, plots
 from kcam.units import nm
 
 runner = CliRunner()
@@ -32,6 +37,11 @@ def fails(*arguments: object) -> str:
     assert output.count("\n") == 1, output
     assert "Traceback" not in output
     return output
+
+
+def unboxed(text: str) -> str:
+    """What typer prints in a box, as one line."""
+    return " ".join(text.replace("\u2502", " ").split())
 
 
 @pytest.fixture
@@ -54,6 +64,20 @@ def test_length(text: str, metres: float) -> None:
 def test_no_length(text: str) -> None:
     with pytest.raises(ValueError, match="is not a length: expected e.g. 2"):
         cli.length(text)
+
+
+@pytest.mark.parametrize("text", ["1;2", "1 2", "1, two"])
+def test_lengths_are_separated_by_commas(text: str) -> None:
+    with pytest.raises(ValueError, match='is not a length: expected e.g. "1, 2, inf" with commas'):
+        cli.lengths(text, unit="m", name="distances")
+
+
+@pytest.mark.parametrize(
+    ("text", "bare"), [("5.5e-7", " A number without a unit is in nm."), ("5 m", ""), ("50", " A num"), ("21 um", "")]
+)
+def test_no_wavelength(text: str, bare: str) -> None:
+    with pytest.raises(ValueError, match=f'wavelengths "{text}" is outside 1e-07 m to 2e-05 m.{bare}.* "450, 550"'):
+        cli.lengths(text, unit="nm", name="wavelengths", expected="450, 550", least=1e-7, most=2e-5)
 
 
 def test_lengths() -> None:
@@ -110,7 +134,47 @@ def test_shoot_bad_input(photo: Path, tmp_path: Path) -> None:
     assert "not a whole safetensors file" in fails("shoot", photo, "--camera", text, "--out", out)
     assert "must end in one of" in fails("shoot", photo, "--out", tmp_path / "shot.xyz")
     assert "there is no folder" in fails("shoot", photo, "--out", tmp_path / "no" / "shot.png")
+    folder = tmp_path / "folder.jpg"
+    folder.mkdir()
+    assert "folder.jpg is a folder. Expected a picture" in fails("shoot", folder, "--out", out)
+    assert "is a folder. Name the file in it" in fails("shoot", photo, "--camera", tmp_path, "--out", out)
+    assert "there is a folder of that name" in fails("shoot", photo, "--out", folder)
+    for seed in (10**22, -1):
+        assert "Invalid value for '--seed'" in run("shoot", photo, "--out", out, "--seed", seed, status=2)
     assert not out.exists()
+
+
+def test_shoot_never_writes_over_the_photo(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = photo.read_bytes()
+    monkeypatch.chdir(tmp_path)  # the same file by another name
+    assert "photo.jpg is the photo itself" in fails("shoot", photo, "--camera", "ideal", "--out", "photo.jpg")
+    assert photo.read_bytes() == before
+
+
+def test_shoot_too_near(photo: Path, tmp_path: Path) -> None:
+    """Where the blur is wider than the picture its light is lost; the distance that the error names is far enough."""
+    out = tmp_path / "shot.png"
+    for distance in ("4 mm", "0.001"):
+        line = fails("shoot", photo, "--distance", distance, "--out", out)
+        assert "it is inside the focal length of 4.3 mm, where nothing has an image" in line
+    line = fails("shoot", photo, "--distance", "0.1", "--out", out)
+    # D d (1/z - 1/2) / pitch = 4.3 / 1.8 mm 4.309 mm 9.5 / 1.4 um
+    assert "0.1 m is too near: a point there blurs over 70 pixels, of which there are 40" in line
+    assert not out.exists()
+    named = re.search(r'--distance "(\d+ cm)"', line)
+    assert named is not None
+    run("shoot", photo, "--camera", "phone", "--distance", named[1], "--out", out)
+    with Image.open(photo) as before, Image.open(out) as after:
+        # the mean of linear light is kept to 10 %: the tails of the blur, 38 of 40 pixels wide, leave the picture
+        linear = [((np.asarray(picture) / 255.0) ** 2.2).mean() for picture in (before, after)]
+    assert linear[1] == pytest.approx(linear[0], rel=0.1)
+
+
+def test_shoot_with_a_linear_camera(photo: Path, tmp_path: Path) -> None:
+    """Without a tone curve colours leave [0,1]; they are clipped, not refused after the work."""
+    (camera := Camera.ideal()[:-1]).save(tmp_path / "linear.safetensors")
+    assert len(camera) == 4
+    run("shoot", photo, "--camera", tmp_path / "linear.safetensors", "--out", tmp_path / "shot.png")
 
 
 def test_shoot_with_a_camera_that_gives_no_picture(photo: Path, tmp_path: Path) -> None:
@@ -124,19 +188,78 @@ def test_psf(tmp_path: Path) -> None:
     run("psf", "--camera", "phone", "--out", out, "--distances", "1, inf", "--wavelengths", "450, 650 nm")
     with Image.open(out) as figure:
         assert figure.width > 800
+    for suffix, start in ((".pdf", b"%PDF"), (".svg", b"<?xml")):
+        run("psf", "--camera", "phone", "--out", out.with_suffix(suffix), "--distances", 2, "--wavelengths", 550)
+        assert out.with_suffix(suffix).read_bytes().startswith(start)
 
 
 def test_psf_bad_input(tmp_path: Path) -> None:
     assert "has no lens" in fails("psf", "--camera", "ideal", "--out", tmp_path / "psf.png")
     assert "must end in one of" in fails("psf", "--out", tmp_path / "psf.txt")
-    assert "wavelength" in fails("psf", "--out", tmp_path / "psf.png", "--wavelengths", "5 m")
+    line = fails("psf", "--out", tmp_path / "psf.png", "--wavelengths", "5.5e-7")
+    assert 'wavelengths "5.5e-7" is outside 1e-07 m to 2e-05 m. A number without a unit is in nm.' in line
+    assert "with commas" in fails("psf", "--out", tmp_path / "psf.png", "--distances", "1;2")
+
+
+def test_help_names_the_units() -> None:
+    """Typer reads [nm] as markup, and drops it."""
+    text = unboxed(run("psf", "--help"))
+    assert "in metres" in text
+    assert "in nanometres" in text
+    assert "in metres" in unboxed(run("shoot", "--help"))
 
 
 def test_pictures_on_disk(tmp_path: Path) -> None:
-    picture = torch.tensor([0.0, 0.5, 2.0, -1.0, float("nan"), 1.0]).view(1, 2, 3)
+    picture = torch.tensor([0.0, 0.5, 2.0, -1.0, 0.2, 1.0]).view(1, 2, 3)
     plots.write_picture(picture, tmp_path / "x.png")
     with Image.open(tmp_path / "x.png") as image:
-        assert np.asarray(image)[..., 1].tolist() == [[0, 128, 255], [0, 0, 255]]
+        assert np.asarray(image)[..., 1].tolist() == [[0, 128, 255], [0, 51, 255]]
+
+
+@pytest.mark.parametrize("suffix", plots.PICTURE_SUFFIXES)
+def test_every_suffix_is_its_format(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"x{suffix}"
+    plots.write_picture(torch.full((3, 4, 5), 0.5), path)
+    with Image.open(path) as image:
+        assert image.size == (5, 4)
+        assert suffix in {s for s, name in Image.registered_extensions().items() if name == image.format}
+
+
+@pytest.mark.parametrize(
+    ("picture", "error", "text"),
+    [
+        (torch.zeros(1, 3, 4, 5), ValueError, r"got \(1, 3, 4, 5\). Use picture\[0\]"),
+        (torch.zeros(4, 5, 3), ValueError, r"got \(4, 5, 3\). Use picture.permute\(2, 0, 1\)"),
+        (torch.zeros(4, 5), ValueError, r"got \(4, 5\). Use picture\[None\]"),
+        (torch.zeros(2, 4, 5), ValueError, r"shape \(3,H,W\) or \(1,H,W\), got \(2, 4, 5\)\.$"),
+        (np.zeros((4, 5, 3)), TypeError, r"a tensor \(3,H,W\) in \[0,1\], got ndarray"),
+        (torch.full((3, 4, 5), 300.0), ValueError, r"from 300 to 300, expected \[0,1\]. Use picture / 255"),
+        (torch.full((3, 4, 5), math.nan), ValueError, r"from nan to nan, expected \[0,1\]. Remove the NaNs"),
+        (torch.full((3, 4, 5), -math.inf), ValueError, r"from -inf to -inf, expected \[0,1\]"),
+    ],
+)
+def test_no_picture_to_write(picture: Any, error: type[Exception], text: str, tmp_path: Path) -> None:
+    with pytest.raises(error, match=text):
+        plots.write_picture(picture, tmp_path / "x.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture, drawing = tmp_path / "x.png", tmp_path / "y.png"
+    plots.write_picture(torch.zeros(3, 4, 5), picture)
+    plots.save_figure(Figure(figsize=(1, 1)), drawing)
+    before = [path.read_bytes() for path in (picture, drawing)]
+
+    def interrupt(descriptor: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files.os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        plots.write_picture(torch.ones(3, 4, 5), picture)
+    with pytest.raises(KeyboardInterrupt):
+        plots.save_figure(Figure(figsize=(2, 2)), drawing)
+    assert [path.read_bytes() for path in (picture, drawing)] == before
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_light_has_its_colour() -> None:
@@ -144,6 +267,57 @@ def test_light_has_its_colour() -> None:
     assert blue.argmax() == 2
     assert green.argmax() == 1
     assert red.argmax() == 0
+
+
+def test_light_that_nobody_sees_is_white() -> None:
+    assert plots.light_colours(torch.tensor([5500.0]) * nm).tolist() == [[1, 1, 1]]
+
+
+@pytest.mark.parametrize("distances", [[1.0], [0.5, 2.0, math.inf]])
+@pytest.mark.parametrize("wavelengths", [[550 * nm], [450 * nm, 650 * nm, 5500 * nm]])
+def test_all_text_of_a_psf_figure_is_inside_it(distances: list[float], wavelengths: list[float]) -> None:
+    imaging = Camera.phone()[0]
+    with torch.no_grad():
+        figure = plots.psf_figure(imaging, distances=distances, wavelengths=wavelengths, title="phone camera")
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    boxes = [text.get_window_extent(canvas.get_renderer()) for text in figure.texts]
+    boxes += [axes.get_tightbbox(canvas.get_renderer()) for axes in figure.axes]
+    for box in boxes:
+        assert min(box.x0, box.y0) >= 0
+        assert box.x1 <= figure.bbox.x1
+        assert box.y1 <= figure.bbox.y1
+    # the light within a radius is a smooth curve: no corner of more than 10 degrees as drawn, 4.2 by 1.8 inches
+    line = figure.axes[-1].lines[0]
+    steps = np.diff(figure.axes[-1].transData.transform(line.get_xydata()), axis=0)
+    assert np.degrees(np.abs(np.diff(np.arctan2(steps[:, 1], steps[:, 0])))).max() < 10
+
+
+@pytest.mark.parametrize("count", [1, 6, 7, 10, 20])
+def test_no_two_curves_are_alike(count: int) -> None:
+    colours = np.array([to_rgb(colour) for colour in plots.distance_colours(count)])
+    apart = np.abs(colours[:, None] - colours).max(-1) + np.eye(count)
+    assert apart.min() > 0.05
+
+
+def test_raw_is_shown_bright_and_black_is_black(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gray wall at 0.3 of the well beside black, in RGGB: its mean over a tile was a dark quarter of red and blue."""
+    shown: list[np.ndarray] = []
+    draw = plots.Sheet.picture
+
+    def picture_of(sheet: plots.Sheet, image: np.ndarray, *where: float, **style: bool) -> Any:
+        shown.append(image)
+        return draw(sheet, image, *where, **style)
+
+    monkeypatch.setattr(plots.Sheet, "picture", picture_of)
+    raw = 0.3 * (torch.arange(80) >= 40).float().expand(1, 60, 80)
+    picture = torch.zeros(3, 60, 80)
+    tile = plots.mosaic_tile(Camera.phone())
+    times = [("ADC", 0.1)]
+    plots.pipeline_figure(scene=picture, raw=raw, picture=picture, tile=tile, times=times, title="t", subtitle="s")
+    panel = next(image for image in shown if image.max() > 0.9)
+    assert panel[:, 60].max() > 0.95
+    assert panel[:, 20].max() == 0
 
 
 def test_durations() -> None:
@@ -162,6 +336,11 @@ def test_demo_small(tmp_path: Path) -> None:
     assert len(steps) == demo.STEPS
     assert len(paths) == 1 + 2 * len(demo.SCENES) * len(demo.CAMERAS) + len(demo.CAMERAS)
     assert all(path.stat().st_size > 500 for path in paths)
+
+
+@pytest.mark.parametrize("inside", ["", "demo"])
+def test_demo_into_a_file(inside: str, photo: Path) -> None:
+    assert "there is a file in its place. Choose a folder" in fails("demo", "--out", photo / inside)
 
 
 @pytest.mark.slow

@@ -202,6 +202,21 @@ def test_cannot_save(module: nn.Module, message: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["x", "x.pt", "x.safetensors.bak"])
+def test_name_must_say_what_it_is(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=f"cannot save {name}: its name must end in .safetensors. Use x.safetensors.$"):
+        store(Gain(1.0), tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "x.safetensors").mkdir()
+    with pytest.raises(ValueError, match="cannot save x.safetensors: there is a folder of that name"):
+        store(Gain(1.0), tmp_path / "x.safetensors")
+    with pytest.raises(FileNotFoundError, match="x.safetensors is a folder. Name the file in it"):
+        restore(tmp_path / "x.safetensors")
+
+
 def test_no_folder(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="cannot save x.safetensors: there is no folder .*nowhere"):
         store(Gain(1.0), tmp_path / "nowhere" / "x.safetensors")

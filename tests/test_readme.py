@@ -113,6 +113,8 @@ def test_example_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[s
     printed = capsys.readouterr().out
     assert EXAMPLES[name][-1] in printed
     assert "False" not in printed
+    lines = [line for line in printed.splitlines() if line.startswith("step")]
+    assert len(lines) == len(set(lines))
 
 
 def test_all_examples_are_run() -> None:
@@ -160,6 +162,8 @@ def test_shell_command_exists(line: str) -> None:
         assert (ROOT / arguments[arguments.index("--constraint") + 1]).is_file()
         pins = (ROOT / "constraints.txt").read_text().splitlines()
         assert all(argument in pins for argument in arguments if "==" in argument)
+    elif program == ".":
+        assert arguments == [".venv/bin/activate"]
     else:
         assert (program, arguments) == ("python3", ["-m", "venv", ".venv"]), "a command that no test knows"
 

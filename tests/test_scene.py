@@ -511,9 +511,15 @@ class TestReadPicture:
         torch.testing.assert_close(scene.to_srgb()[0], image / 255, rtol=0, atol=3e-6)
 
     def test_missing(self, tmp_path: Path) -> None:
-        for path in (tmp_path / "none.jpg", tmp_path):
-            with pytest.raises(FileNotFoundError, match="there is no file .* Expected a picture: PNG, JPEG"):
+        for path, what in ((tmp_path / "none.jpg", "there is no file .*none.jpg"), (tmp_path, "is a folder")):
+            with pytest.raises(FileNotFoundError, match=f"{what}. Expected a picture: PNG, JPEG"):
                 read_picture(path)
+
+    def test_too_large(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        write_image(tmp_path / "photo.png", torch.zeros(3, 4, 5, dtype=torch.uint8))
+        monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 9)  # Pillow refuses twice as many: 20 > 18
+        with pytest.raises(ValueError, match=r"photo.png has more than 0 million pixels.* Make it smaller first\.$"):
+            read_picture(tmp_path / "photo.png")
 
     @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "bmp"])
     def test_cut_short(self, tmp_path: Path, suffix: str) -> None:

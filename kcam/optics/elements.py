@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from kcam.context import arguments_text
 from kcam.optics.materials import refractive_index
 from kcam.optics.pupil import Pupil
 from kcam.ste import round_ste
@@ -67,6 +68,10 @@ class Element(nn.Module):
     def pixel_map(self, wavelengths: Tensor) -> PixelMap | None:
         """What this element does in flat pixels, or None."""
         return None
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        return arguments_text(self)
 
 
 class Aperture(Element):
@@ -226,7 +231,7 @@ class ThinLens(Element):
     avoid.
 
     Args:    focal_length: [m], not 0; negative for a diverging lens; may be a Parameter.
-    Raises:  ValueError for 0, NaN or inf.
+    Raises:  ValueError for 0, NaN or inf, or above 10 m (millimetres by mistake; a tenth of a dioptre is a `Defocus`).
     """
 
     symmetric = True
@@ -237,6 +242,7 @@ class ThinLens(Element):
         value = float(float64(focal_length).detach())
         if value == 0 or value != value or abs(value) == float("inf"):
             raise ValueError(f"focal_length must be finite and not 0 m, got {value:g}.")
+        _check_not_flat(value, name="focal_length")
         set_scalar(self, "focal_length", focal_length)
 
     def vergence(self, wavelengths: Tensor) -> Tensor:
@@ -257,7 +263,8 @@ class PlanoConvexLens(Element):
     Args:
         radius_of_curvature: R [m], > 0; may be a Parameter.
         glass: a name in `materials.GLASSES`, or a refractive index.
-    Raises:  ValueError for R <= 0, an unknown glass, or (from `Lens`) an aperture that reaches R.
+    Raises:  ValueError for R <= 0, R above 10 m (millimetres by mistake), an unknown glass, or (from `Lens`) an
+        aperture that reaches R.
     Valid when the lens is thin: the ray's shift inside the glass is neglected.
     Source:  Goodman, Introduction to Fourier Optics, 3rd ed., section 5.1; thesis (3.7).
     """
@@ -268,6 +275,7 @@ class PlanoConvexLens(Element):
     def __init__(self, radius_of_curvature: Scalar, *, glass: str | float = "N-BK7") -> None:
         super().__init__()
         check_positive(radius_of_curvature, name="radius_of_curvature")
+        _check_not_flat(float(float64(radius_of_curvature).detach()), name="radius_of_curvature")
         refractive_index(glass, wavelengths=wavelength_grid([550e-9]))
         set_scalar(self, "radius_of_curvature", radius_of_curvature)
         self.glass = glass
@@ -549,6 +557,15 @@ def _check_aperture(value: Scalar, *, name: str) -> None:
     metres = float(float64(value).detach())
     if metres > 1:
         raise ValueError(f"{name} {metres:g} m is no aperture. Lengths are in metres; did you mean {metres:g} * mm?")
+
+
+def _check_not_flat(metres: float, *, name: str) -> None:
+    """Beyond 10 m a lens of camera size does nothing that a `Defocus` would not."""
+    if abs(metres) > 10:
+        raise ValueError(
+            f"{name} {metres:g} m is beyond 10 m. Lengths are in metres; did you mean {metres:g} * mm? For a power "
+            "as weak as that use Defocus(vergence)."
+        )
 
 
 def _describe(value: object) -> str:

@@ -229,8 +229,9 @@ class Lens(nn.Module):
         device: torch.device | None = None,
     ) -> Query:
         """The arguments of `psf`, checked, as one value."""
-        if len(shape) != 2 or any(not isinstance(n, int) or n < 1 for n in shape):
-            raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.")
+        if not isinstance(shape, Sequence) or len(shape) != 2 or any(not isinstance(n, int) or n < 1 for n in shape):
+            fix = f" Use shape=({shape}, {shape})." if isinstance(shape, int) and shape >= 1 else ""
+            raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.{fix}")
         if not 0 < fill_factor <= 1:
             raise ValueError(f"fill_factor {fill_factor:g} must be in (0, 1]: the light-sensitive share of a pixel.")
         if samples is not None and (not isinstance(samples, int) or samples < 32):

@@ -88,7 +88,8 @@ class Exposure(Stage):
     (a learned tile: on average over the tile), divided by the ISO gain that the ADC restores. With `time` it is
     physical, `electrons_per_unit` / full_well, from the scene's luminance, the lens's aperture, the pixel and the time:
     stopping down costs photons, and ISO changes the gain but not the electrons. `white_share` then only tells the
-    stages behind the ADC what counts as white.
+    stages behind the ADC what counts as white. So `iso` without `time` keeps the picture's brightness and sets its
+    noise, like a camera that shortens its time: at ISO 800 white is an eighth of the electrons.
 
     The signal is the *mean* relative irradiance over the light-sensitive area of a pixel (a uniform white is 1,
     whatever the fill factor); this stage alone multiplies by that area, pitch^2 fill_factor.

@@ -233,6 +233,9 @@ BAD = [
     ),
     (lambda: optics.ThinLens(0.0), ValueError, r"focal_length must be finite and not 0 m, got 0"),
     (lambda: optics.ThinLens(math.inf), ValueError, r"focal_length must be finite and not 0 m, got inf"),
+    (lambda: optics.ThinLens(50), ValueError, r"focal_length 50 m is beyond 10 m.*did you mean 50 \* mm\? .* Defocus"),
+    (lambda: optics.ThinLens(-10.1), ValueError, r"focal_length -10.1 m is beyond 10 m"),
+    (lambda: optics.PlanoConvexLens(25.8), ValueError, r"radius_of_curvature 25.8 m is beyond .* mean 25.8 \* mm"),
     (lambda: optics.PlanoConvexLens(-25 * mm), ValueError, r"radius_of_curvature must be finite and > 0 m, got -0.025"),
     (lambda: optics.PlanoConvexLens(25 * mm, glass="BK7"), ValueError, r"unknown glass 'BK7'; known: .*N-BK7"),
     (lambda: optics.PlanoConvexLens(25 * mm, glass=1.0), ValueError, r"refractive index 1 must be > 1"),
@@ -277,6 +280,25 @@ def test_an_aperture_must_say_its_shape() -> None:
     for method in (aperture.semi_aperture, aperture.open_share, aperture.rim_per_area):
         with pytest.raises(NotImplementedError):
             method()
+
+
+@pytest.mark.parametrize(
+    ("element", "text"),
+    [
+        (optics.CircularAperture(torch.nn.Parameter(torch.tensor(5 * mm))), "CircularAperture(diameter=0.005)"),
+        (optics.AnnularAperture(5 * mm, obscuration=0.3), "AnnularAperture(diameter=0.005, obscuration=0.3)"),
+        (optics.ThinLens(10.0), "ThinLens(focal_length=10)"),
+        (optics.PlanoConvexLens(25.8 * mm), "PlanoConvexLens(radius_of_curvature=0.0258, glass='N-BK7')"),
+        (optics.Defocus(torch.tensor(0.5)), "Defocus(vergence=0.5)"),
+        (
+            optics.DOE(torch.zeros(4, 4), levels=8),
+            "DOE(phase=(4, 4), design_wavelength=5.5e-07, glass='fused silica', levels=8)",
+        ),
+        (Element(), "Element()"),
+    ],
+)
+def test_an_element_prints_its_values(element: Element, text: str) -> None:
+    assert repr(element) == text
 
 
 def test_a_plain_element_does_nothing() -> None:

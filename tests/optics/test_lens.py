@@ -206,6 +206,7 @@ QUERIES = [
     ({"distances": float("nan")}, r"distance nan is not a distance"),
     ({"distances": torch.ones(2, 2)}, r"distances must be a number or a vector \(Z,\), got shape \(2, 2\)"),
     ({"shape": (33,)}, r"shape must be two positive integers \(H, W\) in pixels, got \(33,\)"),
+    ({"shape": 33}, r"shape must be two positive .* got 33. Use shape=\(33, 33\)"),
     ({"shape": (33, 0)}, r"shape must be two positive integers"),
     ({"shape": (33.0, 33)}, r"shape must be two positive integers"),
     ({"propagator": "fraunhofer"}, r"unknown propagator 'fraunhofer'; known: nonparaxial, fresnel"),
