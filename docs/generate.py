@@ -35,6 +35,7 @@ from PIL import Image  # noqa: E402
 from kcam import Camera, Scene, demo, optics, plots  # noqa: E402
 from kcam.optics.propagation import choose  # noqa: E402
 from kcam.optics.psf import Query  # noqa: E402
+from kcam.tradeoff import Row, Sweep  # noqa: E402
 from kcam.units import mm, nm, um  # noqa: E402
 
 README = ROOT / "README.md"
@@ -172,12 +173,93 @@ def at_peers(trap: str, cases: list[dict[str, Any]]) -> str:
     return "; ".join(found)
 
 
+# ---- what accuracy costs ---------------------------------------------------------------------------------------------
+
+SWEEPS = {"singlet": RESULTS / "tradeoff-singlet.json", "thesis": RESULTS / "tradeoff-thesis.json"}
+TRADEOFF_ROWS = 10
+
+
+def tradeoff_table() -> str:
+    """Ten lines for each camera: the front of raw error and time, the camera as it is, the best baseline."""
+    parts = []
+    for path in SWEEPS.values():
+        sweep = Sweep.load(path)
+        front = sweep.pareto()
+        textbook = [row for row in sweep.rows if row.baseline and row.raw_rms is not None]
+        must = [sweep.default, *sorted(textbook, key=lambda row: row.raw_rms)[:1]]
+        spread = front[:: max(1, math.ceil(len(front) / (TRADEOFF_ROWS - len(must))))]
+        others = sorted((row for row in sweep.rows if row.raw_rms is not None), key=lambda row: row.raw_rms)
+        chosen: list[Row] = []
+        for row in [*must, *spread, *front, *others]:
+            if len(chosen) < TRADEOFF_ROWS and row not in chosen and row.seconds is not None:
+                chosen.append(row)
+        lines = [
+            f"**{sweep.title}**, {sweep.scene}. {sweep.sentence()}",
+            "",
+            "| setting | raw error | PSF error | delta E | time | memory |",
+            "|---|---:|---:|---:|---:|---:|",
+        ]
+        for row in sorted(chosen, key=lambda row: row.seconds or 0):
+            name = f"**{row.name}**" if row in front else row.name
+            note = ", as it is" if row.default else ", baseline" if row.baseline else ""
+            numbers = ["" if v is None else scientific(v) for v in (row.raw_rms, row.psf_l1)]
+            colour = "" if row.delta_e is None else f"{row.delta_e:.2g}"
+            time = f"{figures(row.seconds * 1e3)} ms" if row.seconds < 1 else f"{figures(row.seconds)} s"
+            memory = "" if row.peak_memory is None else f"{figures(row.peak_memory / 1e6)} MB"
+            lines.append(
+                f"| {name}{note} | {' | '.join(numbers)} | {colour} | {'~' if row.share < 1 else ''}{time} | {memory} |"
+            )
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)
+
+
+def tradeoff_picture(path: Path) -> None:
+    """The figure of a committed sweep: docs/tradeoff-NAME.png."""
+    sweep = Sweep.load(SWEEPS[path.stem.removeprefix("tradeoff-")])
+    plots.save_figure(plots.tradeoff_figure(sweep), path, resolution=110)
+
+
+LIBRARY_COLOURS = {
+    "kcam": "#3f6fd8",
+    "textbook": "#75757f",
+    "hcipy": "#2a9d5f",
+    "prysm": "#c98a00",
+    "torchoptics": "#c8553d",
+}
+
+
+def peers_picture(path: Path) -> None:
+    """Error against time of one PSF, each library at several samplings, joined where only the sampling differs."""
+    rows = json.loads((RESULTS / "peers.json").read_text())["accuracy"]
+    sheet = plots.Sheet(9.0, 5.2)
+    sheet.text(0.8, 0.2, "One PSF: error against time", size=plots.TITLE, weight="bold")
+    sheet.text(0.8, 0.52, "297 x 297 pixels of 1 um, f/10, 0.5 waves of defocus, one thread", colour=plots.MUTED)
+    axes = sheet.axes(0.8, 0.85, 6.6, 3.75)
+    axes.set(xscale="log", yscale="log", xlabel="CPU seconds", ylabel="L1 error of the PSF")
+    axes.grid(color=plots.FAINT, lw=0.7)
+    axes.spines[["top", "right"]].set_visible(False)
+    groups: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for row in rows:
+        kind = re.sub(r"[\d.]+( um| x \d+)?", "", row["who"]).strip(" ,")
+        groups.setdefault((row["library"], kind, row["dtype"]), []).append((row["seconds"], row["error"]["l1"]))
+    for (library, _, dtype), points in groups.items():
+        colour = LIBRARY_COLOURS.get(library, plots.INK)
+        x, y = zip(*sorted(points), strict=True)
+        axes.plot(x, y, color=colour, lw=1, marker="o" if dtype == "float32" else "s", ms=5, mec="white", mew=0.5)
+    for index, (library, colour) in enumerate(LIBRARY_COLOURS.items()):
+        sheet.text(7.65, 1.1 + 0.28 * index, "\u25cf", colour=colour, size=plots.LABEL)
+        sheet.text(7.85, 1.11 + 0.28 * index, {**PEERS, "kcam": "kcam"}.get(library, library), size=plots.LABEL)
+    sheet.text(7.65, 2.7, "round: float32", size=plots.SMALL, colour=plots.MUTED)
+    sheet.text(7.65, 2.92, "square: float64", size=plots.SMALL, colour=plots.MUTED)
+    plots.save_figure(sheet.figure, path, resolution=110)
+
+
 # ---- the benchmarks --------------------------------------------------------------------------------------------------
 
 
 def benchmarks_table() -> str:
     """Every default of kcam against the baseline of its race, from benchmarks/results/*.json: losses are bold."""
-    files = [path for path in sorted(RESULTS.glob("*.json")) if path != TRAPS]
+    files = [path for path in sorted(RESULTS.glob("*.json")) if path not in (TRAPS, *SWEEPS.values())]
     parts = [benchmark_part(json.loads(path.read_text()), path) for path in files]
     return "\n\n".join(part for part in parts if part) or "*Not measured yet: `make bench` writes the results.*"
 
@@ -255,6 +337,7 @@ def figures(value: float) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "propagators": propagators_table,
+    "tradeoff": tradeoff_table,
     "traps": traps_table,
     "benchmarks": benchmarks_table,
 }
@@ -394,7 +477,13 @@ def save_jpeg(figure: Any, path: Path, *, resolution: float = 200, largest: int 
     raise ValueError(f"{path.name} has {path.stat().st_size} bytes at quality {quality}; expected < {largest}.")
 
 
-PICTURES: dict[str, Callable[[Path], None]] = {"overview.jpg": overview, "psf_gallery.jpg": gallery}
+PICTURES: dict[str, Callable[[Path], None]] = {
+    "overview.jpg": overview,
+    "psf_gallery.jpg": gallery,
+    "tradeoff-singlet.png": tradeoff_picture,
+    "tradeoff-thesis.png": tradeoff_picture,
+    "peers.png": peers_picture,
+}
 
 
 def main(arguments: list[str] | None = None) -> int:

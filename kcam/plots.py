@@ -440,31 +440,35 @@ def tradeoff_figure(result: Sweep) -> Figure:
 
 
 def _draw_tradeoff(axes: Any, rows: Sequence[Row], error: str) -> None:
-    rows = [row for row in rows if row.seconds is not None and getattr(row, error) is not None]
+    points = [
+        (row, row.seconds, value)
+        for row, value in ((row, getattr(row, error)) for row in rows)
+        if row.seconds is not None and value is not None
+    ]
     axes.set(xscale="log", yscale="log", xlabel="CPU seconds of a picture with new optics")
     axes.grid(color=FAINT, lw=0.7)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED)
     axes.tick_params(labelsize=SMALL, colors=MUTED, length=3, which="both")
     axes.xaxis.label.set(size=SMALL + 0.5, color=MUTED)
-    if not rows:
+    if not points:
         return
-    seen = [getattr(row, error) for row in rows if getattr(row, error) > 1e-9] or [1.0]
+    seen = [value for _, _, value in points if value > 1e-9] or [1.0]
     floor = min(seen) / 6
-    times = [row.seconds for row in rows]
+    times = [seconds for _, seconds, _ in points]
     axes.set(xlim=(min(times) / 1.8, max(times) * 2.5), ylim=(floor / 1.6, max(seen) * 4))
     best = front(rows, error)
-    corners = [(best[0].seconds, max(getattr(best[0], error), floor))]
-    for row in best[1:]:
-        corners += [(row.seconds, corners[-1][1]), (row.seconds, max(getattr(row, error), floor))]
+    on_front = [(seconds, max(value, floor)) for row in best for own, seconds, value in points if own is row]
+    corners = on_front[:1]
+    for seconds, value in on_front[1:]:
+        corners += [(seconds, corners[-1][1]), (seconds, value)]
     corners.append((max(times) * 2.5, corners[-1][1]))
     axes.plot(*zip(*corners, strict=True), color=INK, lw=1.1, alpha=0.35, zorder=1)
     labels = []
-    for row in rows:
+    for row, seconds, value in points:
         colour = INK if row.default else MUTED if row.baseline else KNOB_COLOURS.get(row.knob, INK)
-        value = getattr(row, error)
         axes.plot(
-            row.seconds,
+            seconds,
             max(value, floor),
             marker="v" if value < floor else "D" if row.default else "o",
             ms=7 if row.default else 5.5,
@@ -474,7 +478,7 @@ def _draw_tradeoff(axes: Any, rows: Sequence[Row], error: str) -> None:
             zorder=3,
         )
         name = row.name.removeprefix("nonparaxial ") if row.knob == "propagator" else row.name
-        labels.append((name, row.seconds, max(value, floor), colour, row in best or row.default))
+        labels.append((name, seconds, max(value, floor), colour, row in best or row.default))
     _place_labels(axes, labels, corners)
 
 

@@ -6,6 +6,7 @@ PSFs against the `reference` propagator, of the raw and of the picture against t
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -149,13 +150,13 @@ class Sweep:
             if row.refused is not None:
                 table.add_row(*head, "refused", style="dim")
                 continue
-            low, high = row.seconds_iqr or (None, None)
+            quartiles = "" if row.seconds_iqr is None else "-".join(f"{end * 1e3:.0f}" for end in row.seconds_iqr)
             table.add_row(
                 *head,
                 *(_small(value) for value in (row.psf_l1, row.psf_l1_worst, row.raw_rms)),
                 _number(row.delta_e, "{:.3f}"),
                 ("~" if row.share < 1 else "") + _time(row.seconds),
-                "" if low is None else f"{low * 1e3:.0f}-{high * 1e3:.0f}",
+                quartiles,
                 _number(row.peak_memory, "{:.0f}", 1e-6),
                 style=style,
             )
@@ -191,8 +192,12 @@ class Sweep:
             content = {name: content[name] for name in ("title", "scene", "reference", "environment")}
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path} is not a sweep that kcam tradeoff wrote: {error}.") from error
-        rows = [replace(row, seconds_iqr=row.seconds_iqr and tuple(row.seconds_iqr)) for row in rows]
+        rows = [replace(row, seconds_iqr=_pair(row.seconds_iqr)) for row in rows]
         return cls(rows=tuple(rows), **content)
+
+
+def _pair(quartiles: Sequence[float] | None) -> tuple[float, float] | None:
+    return None if quartiles is None else (quartiles[0], quartiles[1])
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
@@ -596,7 +601,7 @@ def _timed(every: Sequence[Setting], rows: list[Row], *, deadline: float, advanc
             if wanted and time.monotonic() + (row.seconds or 0) < deadline:
                 advance(f"round {turn + 1}, {setting.name}")
                 fresh = _with(camera)
-                own.append(measure.cpu_time(lambda fresh=fresh, setting=setting: _shot(fresh, setting.scene)))
+                own.append(measure.cpu_time(functools.partial(_shot, fresh, setting.scene)))
         if sum(map(len, times)) == before:
             break
         turn += 1
@@ -604,7 +609,7 @@ def _timed(every: Sequence[Setting], rows: list[Row], *, deadline: float, advanc
         replace(
             row,
             seconds=statistics.median(own),
-            seconds_iqr=tuple(np.percentile(own, [25, 75]).tolist()),
+            seconds_iqr=_pair(np.percentile(own, [25, 75]).tolist()),
             calls=len(own),
         )
         if own

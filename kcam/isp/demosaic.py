@@ -438,6 +438,10 @@ class Demosaic(Stage):
     Raises:    ValueError as `demosaic`.
     """
 
+    domain: str
+    pattern: str | None
+    gains: Tensor | None
+
     def __init__(
         self,
         method: str | None = None,
