@@ -374,31 +374,32 @@ def tradeoff_figure(result: Sweep) -> Figure:
 
 
 def _draw_tradeoff(axes: Any, rows: Sequence[Row], error: str) -> None:
-    rows = [row for row in rows if row.seconds is not None and getattr(row, error) is not None]
+    points = [(row, row.seconds, getattr(row, error)) for row in rows if row.seconds is not None]
+    points = [point for point in points if point[2] is not None]
     axes.set(xscale="log", yscale="log", xlabel="CPU seconds of a picture with new optics")
     axes.grid(color=FAINT, lw=0.7)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED)
     axes.tick_params(labelsize=SMALL, colors=MUTED, length=3, which="both")
     axes.xaxis.label.set(size=SMALL + 0.5, color=MUTED)
-    if not rows:
+    if not points:
         return
-    seen = [getattr(row, error) for row in rows if getattr(row, error) > 1e-9] or [1.0]
+    seen = [value for *_, value in points if value > 1e-9] or [1.0]
+    times = [seconds for _, seconds, _ in points]
     floor = min(seen) / 6
-    times = [row.seconds for row in rows]
     axes.set(xlim=(min(times) / 1.8, max(times) * 2.5), ylim=(floor / 1.6, max(seen) * 4))
     best = front(rows, error)
-    corners = [(best[0].seconds, max(getattr(best[0], error), floor))]
-    for row in best[1:]:
-        corners += [(row.seconds, corners[-1][1]), (row.seconds, max(getattr(row, error), floor))]
+    corners: list[tuple[float, float]] = []
+    for _, seconds, value in sorted((point for point in points if point[0] in best), key=lambda point: point[1]):
+        corners += [(seconds, corners[-1][1])] if corners else []
+        corners += [(seconds, max(value, floor))]
     corners.append((max(times) * 2.5, corners[-1][1]))
     axes.plot(*zip(*corners, strict=True), color=INK, lw=1.1, alpha=0.35, zorder=1)
     labels = []
-    for row in rows:
+    for row, seconds, value in points:
         colour = INK if row.default else MUTED if row.baseline else KNOB_COLOURS.get(row.knob, INK)
-        value = getattr(row, error)
         axes.plot(
-            row.seconds,
+            seconds,
             max(value, floor),
             marker="v" if value < floor else "D" if row.default else "o",
             ms=7 if row.default else 5.5,
@@ -408,7 +409,7 @@ def _draw_tradeoff(axes: Any, rows: Sequence[Row], error: str) -> None:
             zorder=3,
         )
         name = row.name.removeprefix("nonparaxial ") if row.knob == "propagator" else row.name
-        labels.append((name, row.seconds, max(value, floor), colour, row in best or row.default))
+        labels.append((name, seconds, max(value, floor), colour, row in best or row.default))
     _place_labels(axes, labels, corners)
 
 

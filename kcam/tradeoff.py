@@ -6,6 +6,7 @@ PSFs against the `reference` propagator, of the raw and of the picture against t
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -76,7 +77,7 @@ class Row:
     raw_rms: float | None = None
     delta_e: float | None = None
     seconds: float | None = None
-    seconds_iqr: tuple[float, float] | None = None
+    seconds_iqr: tuple[float, ...] | None = None
     seconds_kept: float | None = None
     share: float = 1.0
     calls: int = 0
@@ -149,13 +150,12 @@ class Sweep:
             if row.refused is not None:
                 table.add_row(*head, "refused", style="dim")
                 continue
-            low, high = row.seconds_iqr or (None, None)
             table.add_row(
                 *head,
                 *(_small(value) for value in (row.psf_l1, row.psf_l1_worst, row.raw_rms)),
                 _number(row.delta_e, "{:.3f}"),
                 ("~" if row.share < 1 else "") + _time(row.seconds),
-                "" if low is None else f"{low * 1e3:.0f}-{high * 1e3:.0f}",
+                "" if row.seconds_iqr is None else "-".join(f"{second * 1e3:.0f}" for second in row.seconds_iqr),
                 _number(row.peak_memory, "{:.0f}", 1e-6),
                 style=style,
             )
@@ -298,11 +298,12 @@ def _demosaics(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting
     found = [stage for stage in camera if isinstance(stage, isp.Demosaic)]
     if not found or not any(isinstance(stage, sensor.Mosaic) for stage in camera):
         return
-    pattern = found[0].pattern or camera.resolve().pattern
+    own: Any = found[0]
+    pattern = own.pattern or camera.resolve().pattern
     for name, row in isp.DEMOSAICS.items():
         if pattern in row.patterns:
-            stage = isp.Demosaic(name, domain=found[0].domain, pattern=found[0].pattern, gains=found[0].gains)
-            stages = [stage if old is found[0] else old for old in camera]
+            stage = isp.Demosaic(name, domain=own.domain, pattern=own.pattern, gains=own.gains)
+            stages = [stage if old is own else old for old in camera]
             yield Setting("demosaic", name, Camera(*stages, context=camera.context), scene)
 
 
@@ -596,7 +597,7 @@ def _timed(every: Sequence[Setting], rows: list[Row], *, deadline: float, advanc
             if wanted and time.monotonic() + (row.seconds or 0) < deadline:
                 advance(f"round {turn + 1}, {setting.name}")
                 fresh = _with(camera)
-                own.append(measure.cpu_time(lambda fresh=fresh, setting=setting: _shot(fresh, setting.scene)))
+                own.append(measure.cpu_time(functools.partial(_shot, fresh, setting.scene)))
         if sum(map(len, times)) == before:
             break
         turn += 1
