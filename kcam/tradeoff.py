@@ -77,7 +77,7 @@ class Row:
     raw_rms: float | None = None
     delta_e: float | None = None
     seconds: float | None = None
-    seconds_iqr: tuple[float, float] | None = None
+    seconds_iqr: tuple[float, ...] | None = None
     seconds_kept: float | None = None
     share: float = 1.0
     calls: int = 0
@@ -303,11 +303,12 @@ def _demosaics(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting
     found = [stage for stage in camera if isinstance(stage, isp.Demosaic)]
     if not found or not any(isinstance(stage, sensor.Mosaic) for stage in camera):
         return
-    pattern = found[0].pattern or camera.resolve().pattern
+    own: Any = found[0]
+    pattern = own.pattern or camera.resolve().pattern
     for name, row in isp.DEMOSAICS.items():
         if pattern in row.patterns:
-            stage = isp.Demosaic(name, domain=found[0].domain, pattern=found[0].pattern, gains=found[0].gains)
-            stages = [stage if old is found[0] else old for old in camera]
+            stage = isp.Demosaic(name, domain=own.domain, pattern=own.pattern, gains=own.gains)
+            stages = [stage if old is own else old for old in camera]
             yield Setting("demosaic", name, Camera(*stages, context=camera.context), scene)
 
 
