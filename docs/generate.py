@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import hashlib
 import io
 import json
 import math
@@ -215,8 +216,18 @@ def tradeoff_table() -> str:
 
 def tradeoff_picture(path: Path) -> None:
     """The figure of a committed sweep: docs/tradeoff-NAME.png."""
-    sweep = Sweep.load(SWEEPS[path.stem.removeprefix("tradeoff-")])
-    plots.save_figure(plots.tradeoff_figure(sweep), path, resolution=110)
+    source = SWEEPS[path.stem.removeprefix("tradeoff-")]
+    save_plot(plots.tradeoff_figure(Sweep.load(source)), path, source=source)
+
+
+def save_plot(figure: Any, path: Path, *, source: Path) -> None:
+    """A figure as a PNG that carries the digest of the results it shows, so that a test can tell an old one."""
+    figure.savefig(path, dpi=110, facecolor="white", metadata={"Source": digest(source)})
+
+
+def digest(source: Path) -> str:
+    """Name and SHA-256 of a file of results."""
+    return f"{source.name} {hashlib.sha256(source.read_bytes()).hexdigest()}"
 
 
 LIBRARY_COLOURS = {
@@ -230,7 +241,8 @@ LIBRARY_COLOURS = {
 
 def peers_picture(path: Path) -> None:
     """Error against time of one PSF, each library at several samplings, joined where only the sampling differs."""
-    rows = json.loads((RESULTS / "peers.json").read_text())["accuracy"]
+    source = RESULTS / "peers.json"
+    rows = json.loads(source.read_text())["accuracy"]
     sheet = plots.Sheet(9.0, 5.2)
     sheet.text(0.8, 0.2, "One PSF: error against time", size=plots.TITLE, weight="bold")
     sheet.text(0.8, 0.52, "297 x 297 pixels of 1 um, f/10, 0.5 waves of defocus, one thread", colour=plots.MUTED)
@@ -251,7 +263,7 @@ def peers_picture(path: Path) -> None:
         sheet.text(7.85, 1.11 + 0.28 * index, {**PEERS, "kcam": "kcam"}.get(library, library), size=plots.LABEL)
     sheet.text(7.65, 2.7, "round: float32", size=plots.SMALL, colour=plots.MUTED)
     sheet.text(7.65, 2.92, "square: float64", size=plots.SMALL, colour=plots.MUTED)
-    plots.save_figure(sheet.figure, path, resolution=110)
+    save_plot(sheet.figure, path, source=source)
 
 
 # ---- the benchmarks --------------------------------------------------------------------------------------------------
@@ -476,6 +488,9 @@ def save_jpeg(figure: Any, path: Path, *, resolution: float = 200, largest: int 
             return
     raise ValueError(f"{path.name} has {path.stat().st_size} bytes at quality {quality}; expected < {largest}.")
 
+
+PLOTS = {"peers.png": RESULTS / "peers.json"} | {f"tradeoff-{name}.png": path for name, path in SWEEPS.items()}
+"""Plot -> the results that it shows."""
 
 PICTURES: dict[str, Callable[[Path], None]] = {
     "overview.jpg": overview,

@@ -186,6 +186,17 @@ def test_generated_table_is_in_step(name: str) -> None:
     assert found[1] == generate.TABLES[name](), "run python docs/generate.py"
 
 
+@pytest.mark.parametrize("name", generate.PLOTS)
+def test_plot_shows_the_committed_results(name: str) -> None:
+    with Image.open(ROOT / "docs" / name) as plot:
+        assert plot.info["Source"] == generate.digest(generate.PLOTS[name]), "run python docs/generate.py --pictures"
+
+
+def test_the_tradeoff_has_ten_lines_for_two_cameras() -> None:
+    lines = [line for line in generate.tradeoff_table().splitlines() if line.startswith("| ")]
+    assert len(lines) == 2 * (1 + 10)
+
+
 def test_every_propagator_is_in_the_table() -> None:
     table = generate.propagators_table()
     assert len(table.splitlines()) == 2 + len(optics.PROPAGATORS) + 1, "and the model's own error"

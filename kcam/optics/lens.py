@@ -80,6 +80,10 @@ class Lens(nn.Module):
             "focus_wavelength": self.focus_wavelength,
         }
 
+    def extra_repr(self) -> str:
+        """The sensor's place, for print()."""
+        return f"sensor_distance={float(float64(self.sensor_distance).detach()):.6g}"
+
     @property
     def aperture(self) -> Aperture:
         """The element that bounds the pupil."""
@@ -331,7 +335,6 @@ class Lens(nn.Module):
         Args: those of `psf`; fill_factor and integrate change nothing, for the irradiance is what counts here.
         Returns: (Z, L, K + 1) for radii k * pixel_pitch, k = 0..K = min(H, W) // 2, rising from 0.
         """
-        largest = min(shape) // 2
         query = self.query(
             wavelengths,
             distances=distances,
@@ -342,6 +345,7 @@ class Lens(nn.Module):
             integrate=integrate,
             dtype=dtype,
         )
+        largest = min(query.shape) // 2
         curves = []
         for wavelength in query.wavelengths:
             fine = 3 * _points_per_pixel(query, wavelength)

@@ -263,3 +263,14 @@ def test_the_corners_of_a_square_aperture_must_stay_on_the_surface_too() -> None
 def test_a_parameter_in_millimetres_is_named_as_a_number() -> None:
     with pytest.raises(ValueError, match=r"diameter 5 m is no aperture.*did you mean 5 \* mm"):
         optics.CircularAperture(nn.Parameter(torch.tensor(5.0)))
+
+
+def test_a_lone_shape_is_refused_by_every_question() -> None:
+    arguments = {"distances": 2.0, "pixel_pitch": 4 * um, "shape": 65}
+    for ask in (thin_lens().psf, thin_lens().mtf, thin_lens().encircled_energy, thin_lens().explain):
+        with pytest.raises(ValueError, match=r"shape must be two positive integers .*65"):
+            ask([WAVELENGTH], **arguments)
+
+
+def test_a_lens_prints_where_its_sensor_is() -> None:
+    assert "sensor_distance=0.05" in repr(thin_lens())
