@@ -181,7 +181,6 @@ class Sweep:
         return {
             "title": self.title,
             "scene": self.scene,
-            "sentence": self.sentence(),
             "reference": self.reference,
             "environment": self.environment,
             "rows": [asdict(row) for row in self.rows],
