@@ -27,7 +27,7 @@ from torch.nn import functional as F
 from kcam import isp, measure, sensor
 from kcam.camera import DEMOSAICING, Camera
 from kcam.optics import PROPAGATORS, Imaging
-from kcam.optics.propagation import Propagator, choose
+from kcam.optics.propagation import PHYSICS, Propagator, choose
 from kcam.optics.psf import Query, ray_displacement, samples_by_rule
 from kcam.optics.reference import Convergence, checked_psf
 from kcam.optics.textbook import textbook_angular_spectrum_row, textbook_row
@@ -132,7 +132,14 @@ class Sweep:
                 f" Giving accuracy up, {row.name} takes {_ratio(row, here)} times the time for "
                 f"{_accuracy(row.raw_rms)}."
             )
-        return text
+        return text + self._model()
+
+    def _model(self) -> str:
+        """On which model the knobs were turned, where that is not the camera's own."""
+        own = self.default.name.split()[0]
+        if own == "nonparaxial" or own not in PHYSICS:
+            return ""
+        return f" The camera's own model is {own}; all knobs but the propagator are turned on the non-paraxial one."
 
     def table(self) -> Table:
         """The rows for a terminal, knob by knob; * marks those on the front of raw error and time."""
@@ -164,7 +171,9 @@ class Sweep:
             "Empty: the knob does not change it, or it was not measured. ~: told from a few of the PSFs. Demosaics are "
             "held to the same camera with three full planes, so their delta E stands by itself."
         )
-        table.caption += "".join(f"\n{row.name} refused: {row.refused}" for row in self.rows if row.refused)
+        table.caption += self._model() + "".join(
+            f"\n{row.name} refused: {row.refused}" for row in self.rows if row.refused
+        )
         table.caption_justify = "left"
         return table
 
@@ -173,7 +182,6 @@ class Sweep:
         return {
             "title": self.title,
             "scene": self.scene,
-            "sentence": self.sentence(),
             "reference": self.reference,
             "environment": self.environment,
             "rows": [asdict(row) for row in self.rows],

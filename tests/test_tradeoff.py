@@ -151,6 +151,10 @@ def test_the_sentence_of_rows_by_hand() -> None:
     assert best.sentence() == (
         "On this machine no setting is ten times as accurate as the camera as it is, a raw error of 1.0e-03 in 500 ms."
     )
+    fresnel = made(("fresnel fft", 0.5, 1e-3), default="fresnel fft")
+    assert fresnel.sentence().endswith(
+        "The camera's own model is fresnel; all knobs but the propagator are turned on the non-paraxial one."
+    )
     refused = Sweep("t", "s", (Row("k", "here", default=True, refused="it is too dark."),))
     assert refused.sentence() == "The camera as it is was not measured: it is too dark."
 
