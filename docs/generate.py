@@ -222,7 +222,7 @@ def tradeoff_picture(path: Path) -> None:
 
 def save_plot(figure: Any, path: Path, *, source: Path) -> None:
     """A figure as a PNG that carries the digest of the results it shows, so that a test can tell an old one."""
-    figure.savefig(path, dpi=110, facecolor="white", metadata={"Source": digest(source)})
+    figure.savefig(path, dpi=140, facecolor="white", metadata={"Source": digest(source)})
 
 
 def digest(source: Path) -> str:

@@ -474,7 +474,9 @@ class _Truth:
         psfs, measured = checked_psf(query)
         seconds = time.process_time() - start
         count = _sample_counts(imaging, scene, [REFERENCE_KAPPA])[0]
-        fine = _with(camera, propagator="nonparaxial", method=None, samples=count)
+        # the Hankel form has no pupil grid, and no error of one
+        finely = {} if imaging.lens.symmetric else {"samples": count}
+        fine = _with(camera, propagator="nonparaxial", method=None, **finely)
         double = scene.to(dtype=torch.float64)
         bank = _imaging(fine).psf_bank(query.wavelengths, vergences=query.vergences, shape=whole.shape, like=psfs)
         raw, picture = _shot(fine.noiseless(), double)

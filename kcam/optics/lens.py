@@ -419,7 +419,7 @@ class Lens(nn.Module):
         if not fastest <= self.f_number <= slowest:
             limits = (width * self.f_number / number * 1e3 for number in (slowest, fastest))
             warnings.warn(
-                f"f/{self.f_number:.2g} is outside f/{fastest:g}..f/{slowest:g}, where PSFs were tested against "
+                f"f/{self.f_number:.3g} is outside f/{fastest:g}..f/{slowest:g}, where PSFs were tested against "
                 "Rayleigh-Sommerfeld: computed all the same, but with an unknown error. An aperture of "
                 "{:.2g} to {:.2g} mm is within.".format(*limits),
                 UserWarning,

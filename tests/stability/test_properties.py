@@ -133,7 +133,7 @@ def test_a_batch_is_its_members(imaging: optics.Imaging, scene: Scene, stages: t
 
 @examples(25)
 @given(
-    st.data(), between(0.5, 4), between(25, 60), distances, distances, wavelengths(), between(1, 12), between(0.3, 3),
+    st.data(), between(0.8, 4), between(25, 60), distances, distances, wavelengths(), between(1, 12), between(0.3, 3),
 )  # fmt: skip
 def test_all_lengths_scale_together(
     data: st.DataObject, width: float, focal: float, focus: float, distance: float, grid: Tensor, pitch: float,
