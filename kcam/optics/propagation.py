@@ -13,7 +13,7 @@ from dataclasses import replace
 from torch import Tensor, nn
 
 from kcam.optics.angular_spectrum import MOST_SAMPLES, angular_spectrum_psf, spectrum_grids, too_many
-from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, trace
+from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, map_phase, trace
 from kcam.optics.polar import radial_psf
 from kcam.optics.psf import Query, fft_grid, grid_psf, ray_displacement, samples_by_rule
 from kcam.optics.pupil import EDGE_MARGIN
@@ -100,9 +100,13 @@ def _debye_error(query: Query) -> float:
 
 
 def _paraxial_error(rays: Rays, query: Query) -> float:
-    """What dropping the spheres' higher terms costs: the rms of their phase, and of the scale of the pattern."""
+    """What dropping the spheres' higher terms costs: the rms of their phase, and of the scale of the pattern.
+
+    1.5 times their sum (a fit: the sum itself is 0.85 of the truth in the median, and 3 times too small at worst). A
+    map's phase is moved by up to tau / 2 of its width, which counts like as much of its phase.
+    """
     tau = float(query.semi_aperture.detach() / query.sensor_distance.detach()) ** 2
-    return rays.beyond + tau if query.paraxial else 0.0
+    return 1.5 * (rays.beyond + tau * (1 + map_phase(query) / 2)) if query.paraxial else 0.0
 
 
 def _grid_estimate(method: str) -> Callable[[Query], float]:

@@ -364,7 +364,11 @@ def _amplitude(
             weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
         transmission = power = unfold_quadrant(weights).to(query.device)
     else:
-        power = map_onto(cells.power, cells.weights).to(torch.float64)
+
+        def passed(tau: float) -> Tensor:
+            return map_onto(cells.power, _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved))
+
+        power = _following(query.tau, passed, spacing=spacing).to(torch.float64)
         transmission = torch.ones_like(power)
     amplitude, energy = transmission[None], power[None]
     if not query.paraxial:
@@ -469,19 +473,24 @@ def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: flo
 
 def _pixel_field(query: Query, cells: _Cells, *, count: int, spacing: float, curved: bool) -> Pair:
     """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (L, N, N)."""
-    corner = 1.05 if query.lens.round else 1.05 * math.sqrt(2)
 
     def both(tau: float) -> Tensor:
-        warp = None
-        if not (curved or query.paraxial):
-            warp = Warp.build(
-                count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device
-            )
-        onto = cells.weights if warp is None else _Warped(cells.weights, warp)
+        onto = _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved)
         return torch.stack(_PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto))
 
     re, im = _following(query.tau, both, spacing=spacing)
     return re, im
+
+
+def _onto_grid(
+    query: Query, cells: _Cells, tau: float, *, count: int, spacing: float, curved: bool
+) -> MapWeights | _Warped:
+    """The way from the cells to the pupil grid: that of the true plane, or on to the image-side plane."""
+    if curved or query.paraxial:
+        return cells.weights
+    corner = 1.05 if query.lens.round else 1.05 * math.sqrt(2)
+    warp = Warp.build(count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device)
+    return cells.weights if warp is None else _Warped(cells.weights, warp)
 
 
 @dataclass(frozen=True)

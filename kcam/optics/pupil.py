@@ -14,6 +14,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -293,6 +294,16 @@ class MapWeights:
         return field
 
 
+class Onto(Protocol):
+    """A linear map of pixels onto the pupil grid, with its transpose."""
+
+    def forward(self, field: Tensor) -> Tensor:
+        """(n, n) -> (N, N)."""
+
+    def adjoint(self, grid: Tensor) -> Tensor:
+        """(N, N) -> (n, n)."""
+
+
 class _MapOnto(torch.autograd.Function):
     """`MapWeights.forward` with its adjoint."""
 
@@ -306,7 +317,7 @@ class _MapOnto(torch.autograd.Function):
         return ctx.weights.adjoint(grad), None
 
 
-def map_onto(field: Tensor, weights: MapWeights) -> Tensor:
+def map_onto(field: Tensor, weights: Onto) -> Tensor:
     """A map of pixels (n, n) on the pupil grid (N, N); differentiable in the map."""
     return _MapOnto.apply(field, weights)
 
