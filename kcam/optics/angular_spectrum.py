@@ -12,8 +12,6 @@ from kcam.optics.psf import Query, ray_displacement, residual_path, to_pixels
 from kcam.optics.pupil import Pupil, pixel_under, round_weights, unfold_quadrant
 from kcam.optics.transforms import fast_length
 
-MOST_SAMPLES = 8192
-
 
 def angular_spectrum_psf(query: Query) -> Tensor:
     """PSFs by the band-limited angular spectrum of the field behind the lens, which must sample the converging wave.
@@ -25,18 +23,8 @@ def angular_spectrum_psf(query: Query) -> Tensor:
     """
     bands = []
     for index, (count, pitch) in enumerate(spectrum_grids(query)):
-        if count > MOST_SAMPLES:
-            raise ValueError(f"angular_spectrum {too_many(count)}")
         bands.append(_spectrum_band(query, index, count=count, pitch=pitch))
     return torch.stack(bands, dim=1)
-
-
-def too_many(count: int) -> str:
-    """Why a grid is refused."""
-    return (
-        f"needs a grid of {count} to sample the wave that converges from the aperture, more than {MOST_SAMPLES}; use "
-        "propagator='nonparaxial', which samples the residual only."
-    )
 
 
 def spectrum_grids(query: Query) -> list[tuple[int, float]]:

@@ -35,6 +35,20 @@ class PixelMap:
     half_width: Scalar | None
     factors: Tensor | None
 
+    def largest_phase(self) -> Tensor:
+        """A phase at the wavelength that it is largest at, (n, n) float64 [rad], without a gradient."""
+        scale = 1.0 if self.factors is None else float(self.factors.max())
+        return self.values.detach().to(torch.float64) * scale
+
+    def steps(self) -> tuple[Tensor, Tensor]:
+        """What `largest_phase` steps by between neighbours, down and across, wrapped into [-pi, pi) [rad]."""
+        down, across = (self.largest_phase().diff(dim=dim) for dim in (0, 1))
+        return _wrapped(down), _wrapped(across)
+
+
+def _wrapped(phase: Tensor) -> Tensor:
+    return torch.remainder(phase + torch.pi, 2 * torch.pi) - torch.pi
+
 
 def set_scalar(module: nn.Module, name: str, value: Scalar) -> None:
     """Store a scalar under its own name: a Parameter trains, a tensor is a buffer, a number stays a float64 number."""

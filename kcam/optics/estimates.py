@@ -136,9 +136,7 @@ def jumps(query: Query) -> float:
     for element in query.lens.elements:
         pixels = element.pixel_map(query.wavelengths)
         if pixels is not None and pixels.factors is not None and pixels.values.shape[-1] > 1:
-            phase = pixels.values.detach().double() * float(pixels.factors.max())
-            steps = torch.cat([phase.diff(dim=dim).flatten() for dim in (0, 1)])
-            total += float((torch.remainder(steps + math.pi, 2 * math.pi) - math.pi).square().mean())
+            total += float(torch.cat([step.flatten() for step in pixels.steps()]).square().mean())
     return math.sqrt(total)
 
 
@@ -148,5 +146,5 @@ def map_phase(query: Query) -> float:
     for element in query.lens.elements:
         pixels = element.pixel_map(query.wavelengths)
         if pixels is not None and pixels.factors is not None:
-            total += float((pixels.values.detach().double() * float(pixels.factors.max())).std(correction=0)) ** 2
+            total += float(pixels.largest_phase().var(correction=0))
     return math.sqrt(total)

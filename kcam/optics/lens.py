@@ -132,8 +132,7 @@ class Lens(nn.Module):
                 continue
             half_width = query.semi_aperture.detach() if pixels.half_width is None else pixels.half_width
             pitch = 2 * float(half_width) / pixels.values.shape[-1]
-            phase = pixels.values.detach().to(torch.float64) * float(pixels.factors.max())
-            steps = [torch.remainder(phase.diff(dim=dim) + torch.pi, 2 * torch.pi) - torch.pi for dim in (0, 1)]
+            steps = pixels.steps()
             sizes = torch.cat([step.abs().flatten() for step in steps])
             slope = float(sizes.kthvalue(math.ceil(0.999 * sizes.numel())).values) / (2 * torch.pi)
             lost = sum(float(step.square().mean()) for step in steps) / (2 * torch.pi**2)

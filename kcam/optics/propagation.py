@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from torch import Tensor, nn
 
-from kcam.optics.angular_spectrum import MOST_SAMPLES, angular_spectrum_psf, spectrum_grids, too_many
+from kcam.optics.angular_spectrum import angular_spectrum_psf, spectrum_grids
 from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, map_phase, trace
 from kcam.optics.polar import radial_psf
 from kcam.optics.psf import Query, fft_grid, grid_psf, ray_displacement, samples_by_rule
@@ -23,6 +23,7 @@ from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 
 _FFT_SLOWNESS = 10.0  # operations of a matrix product in the time of one of an FFT, measured on a CPU in float32
+_MOST_SPECTRUM_SAMPLES = 8192  # on each axis, of a field in complex128: 1 GB
 _MAP_SETUP = 2e5  # operations for each pupil sample, of weights that bring a map onto a new grid; measured likewise
 
 
@@ -205,7 +206,12 @@ def _needs_few_samples(query: Query) -> str | None:
         count = max((count for count, _ in spectrum_grids(query)), default=0)
     except ValueError as error:  # samples that the user gave
         return str(error)
-    return too_many(count) if count > MOST_SAMPLES else None
+    if count <= _MOST_SPECTRUM_SAMPLES:
+        return None
+    return (
+        f"needs a grid of {count} to sample the wave that converges from the aperture, more than "
+        f"{_MOST_SPECTRUM_SAMPLES}; use propagator='nonparaxial', which samples the residual only."
+    )
 
 
 def _needs_fine_points(query: Query) -> str | None:

@@ -26,6 +26,7 @@ from kcam.optics.pupil import (
     disc_coverage,
     disc_weights,
     from_image_side,
+    grid_nodes,
     grid_spacing,
     map_onto,
     map_weights,
@@ -286,7 +287,7 @@ def _grid_group(
         scale_step = float(scales[0].detach()) * slope * step
         extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]])) / step
         count, length, spacing = fft_grid(scale_step, shortest=max(math.ceil(extent), 2 * reach + 1))
-    nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
+    nodes = grid_nodes(count, spacing=spacing)
 
     cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
     x, y = nodes[None, :].to(query.device), nodes[:, None].to(query.device)

@@ -78,9 +78,10 @@ def pupil_tau(semi_aperture: Tensor, sensor_distance: Tensor, *, paraxial: bool)
     return torch.zeros_like(tau) if paraxial else tau
 
 
-def grid_nodes(count: int) -> Tensor:
-    """Nodes xi' of a pupil grid of `count` samples, the rim EDGE_MARGIN samples inside; (count,) float64."""
-    return (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * grid_spacing(count)
+def grid_nodes(count: int, *, spacing: float | None = None) -> Tensor:
+    """Nodes xi' of a pupil grid, (count,) float64, symmetric about 0; by default the rim is EDGE_MARGIN inside."""
+    spacing = grid_spacing(count) if spacing is None else spacing
+    return (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
 
 
 def grid_spacing(count: int) -> float:
@@ -336,7 +337,7 @@ def map_weights(
     Valid when the grid has at least 2.5 samples per cycle of what reaches the window (the default sampling).
     """
     edges = torch.linspace(-half_width, half_width, pixels + 1, dtype=torch.float64)
-    nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
+    nodes = grid_nodes(count, spacing=spacing)
     return MapWeights.build(pixel_weights(edges, nodes, spacing=spacing).T, dtype=dtype, device=device)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.pupil import map_kernel
+from kcam.optics.pupil import grid_nodes, map_kernel
 
 _SLAB = 64  # columns: narrow enough to leave out most zeros, wide enough for a matrix product
 _SMALLEST = 3e-5  # coefficient of the series that is kept
@@ -41,7 +41,7 @@ class Warp:
         count: int, *, spacing: float, tau: float, corner: float, dtype: torch.dtype, device: torch.device
     ) -> Warp | None:
         """For pupil grids (N, N), both planes alike; None where nothing moves. corner: largest rho that matters."""
-        nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
+        nodes = grid_nodes(count, spacing=spacing)
         x, y = nodes[None, :], nodes[:, None]
         # along x at a true y, then along y at an image-side x: rho'^2 = rho^2 (1 + tau) / (1 + tau rho^2)
         along_x = x * (torch.sqrt((1 + tau * y**2) / (1 + tau - tau * x**2).clamp(min=0.1)) - 1)
