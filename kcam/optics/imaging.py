@@ -2,28 +2,26 @@
 
     I_c = sum_z,l kappa_cl (I_zl * h_zl)
 
-computed with the sum over wavelengths *inside* the Fourier transform: the picture is transformed once per plane of the
-scene's factors, and back once per channel, not once per band.
+How the picture is convolved stands in `convolution`; here is which PSFs, for which layers of depth.
 """
 
 from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from kcam.cache import ValueCache, fingerprint
 from kcam.context import Context, Stage
+from kcam.optics.convolution import BORDERS, Renderer
 from kcam.optics.lens import Lens
 from kcam.optics.propagation import PHYSICS, Propagator, choose
 from kcam.optics.psf import Query, ray_displacement
-from kcam.optics.transforms import fast_length
+from kcam.optics.sampling import KAPPA
 from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
@@ -31,10 +29,8 @@ from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 if TYPE_CHECKING:
     from kcam.sensor.colour_filter import ColourFilter
 
-BORDERS = ("reflect", "replicate", "periodic", "zero")
 OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
-_BANDS_AT_ONCE = 4  # at most, in the buffer of a contraction: small enough to stay in the processor's cache
 _COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
 
 
@@ -56,8 +52,17 @@ class Imaging(Stage):
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
         distance: of a plain tensor [m]; None: where the lens is focused.
         max_memory: bytes that the transforms may take; bands are split to stay below, with the same result.
-    Raises: ValueError for an unknown propagator or border, a pitch not in metres, a shape or count that is not
-        positive.
+        tile: side of the squares that are convolved one by one [pixels], or None; in less memory, with the same result.
+        direct: convolve in the picture, without a Fourier transform: faster for small windows, with the same result.
+    What follows are shortcuts, with errors that a `Plan` weighs:
+        blur: False lets each point light its own pixel only.
+        kappa: pupil samples per fringe, see `optics.sampling.pupil_samples`; None for its default.
+        renormalise: give a PSF that psf_shape cuts its whole light again.
+        occlusion: False adds the layers up, also where a nearer one hides a farther one.
+        rank: of the scene's spectra, at most, see `Scene.low_rank`; None for its own.
+        precision: "float32" computes so whatever the scene's type; None for the scene's.
+    Raises: ValueError for an unknown propagator, border or precision, a pitch not in metres, a shape or count that is
+        not positive, a kappa of 1 or less.
     """
 
     def __init__(
@@ -77,6 +82,14 @@ class Imaging(Stage):
         fill_factor: float = 1.0,
         distance: float | None = None,
         max_memory: float = 2e9,
+        tile: int | None = None,
+        direct: bool = False,
+        blur: bool = True,
+        kappa: float | None = None,
+        renormalise: bool = False,
+        occlusion: bool = True,
+        rank: int | None = None,
+        precision: str | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(lens, Lens):
@@ -85,10 +98,18 @@ class Imaging(Stage):
             raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
         if border not in BORDERS:
             raise ValueError(f"unknown border {border!r}; known: {', '.join(BORDERS)}.")
-        if layers is not None and layers < 1:
-            raise ValueError(f"layers must be a positive number of depth layers, or None, got {layers}.")
-        if bands is not None and bands < 1:
-            raise ValueError(f"bands must be a positive number of wavelengths, or None for all, got {bands}.")
+        for name, value, of in (
+            ("layers", layers, "depth layers"),
+            ("bands", bands, "wavelengths"),
+            ("tile", tile, "pixels"),
+            ("rank", rank, "factors"),
+        ):
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be a positive number of {of}, or None, got {value}.")
+        if kappa is not None and not kappa > 1:
+            raise ValueError(f"kappa must be above 1 sample per fringe, got {kappa:g}. Its default is {KAPPA:g}.")
+        if precision not in (None, "float32", "float64"):
+            raise ValueError(f'precision must be "float32", "float64" or None for the scene\'s, got {precision!r}.')
         if distance is not None:
             check_distances(distance)
         if not max_memory > 0:
@@ -100,6 +121,8 @@ class Imaging(Stage):
         self.integrate, self.bands = integrate, bands
         self.layers, self.interpolate, self.border, self.fill_factor = layers, interpolate, border, fill_factor
         self.distance, self.max_memory = distance, float(max_memory)
+        self.tile, self.direct, self.blur, self.kappa, self.renormalise = tile, direct, blur, kappa, renormalise
+        self.occlusion, self.rank, self.precision = occlusion, rank, precision
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
         query = self._query(wavelength_grid([550e-9]), torch.zeros(1), self.psf_shape or (1, 1), torch.empty(0))
         if method is not None:
@@ -128,8 +151,12 @@ class Imaging(Stage):
         """
         if not isinstance(scene, Scene):
             scene = self._as_scene(scene, context or Context())
+        if self.rank is not None and self.rank < scene.coefficients.shape[1]:
+            scene = scene.low_rank(self.rank)
         planes = scene.coefficients
         working = planes if planes.dtype in (torch.float32, torch.float64) else planes.float()
+        if self.precision is not None:
+            working = planes.to(getattr(torch, self.precision))
         contraction = None if colour_filter is None else colour_filter.contraction(scene.wavelengths)
         with full_precision(working.device):
             result = self._render(scene, working, contraction).to(planes.dtype)
@@ -141,6 +168,8 @@ class Imaging(Stage):
         Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a
         rim of length P around an area A spreads beyond a radius.
         """
+        if not self.blur:
+            return 1, 1
         if self.psf_shape is not None:
             return self.psf_shape
         query = self._query(wavelengths, vergences, (1, 1), torch.empty(0, dtype=torch.float64))
@@ -156,6 +185,8 @@ class Imaging(Stage):
         A step dV in vergence is a^2 dV / (2 lambda) waves of defocus at the rim.
         """
         vergence = 1 / depth.detach().to(torch.float64)
+        if not self.blur:
+            return vergence.flatten()[:1]
         low, high = float(vergence.min()), float(vergence.max())
         if low == high:
             return torch.tensor([low], dtype=torch.float64)
@@ -190,7 +221,7 @@ class Imaging(Stage):
 
     def _query(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Query:
         distances = 1 / vergences.detach().to(torch.float64)
-        return self.lens.query(
+        query = self.lens.query(
             wavelengths,
             distances=distances,
             pixel_pitch=self.pixel_pitch,
@@ -201,11 +232,14 @@ class Imaging(Stage):
             dtype=like.dtype,
             device=like.device,
         )
+        return query if self.kappa is None else replace(query, kappa=self.kappa)
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the bands of a scene, (Z, L, h, w) in the dtype and on the device of `like`; kept while nothing
         changes.
         """
+        if not self.blur:
+            return like.new_ones(len(vergences), len(wavelengths), 1, 1)
         groups = list(wavelengths.argsort().tensor_split(min(self.bands or len(wavelengths), len(wavelengths))))
         query = self._query(wavelengths, vergences, shape, like)
         if len(groups) < len(wavelengths):
@@ -213,6 +247,8 @@ class Imaging(Stage):
 
         def build() -> Tensor:
             psfs = choose(query, propagator=self.propagator, method=self.method)(query)
+            if self.renormalise:
+                psfs = psfs / psfs.sum((-2, -1), keepdim=True)
             if len(groups) == len(wavelengths):
                 return psfs
             owner = torch.empty(len(wavelengths), dtype=torch.long)
@@ -225,7 +261,7 @@ class Imaging(Stage):
         return self._bank_cache.get(self._optics_key(wavelengths, vergences, shape, like), build)
 
     def _optics_key(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> tuple:
-        how = (self.propagator, self.method, self.samples, self.integrate, self.bands)
+        how = (self.propagator, self.method, self.samples, self.integrate, self.bands, self.kappa, self.renormalise)
         pixel = (self.pixel_pitch, self.fill_factor)
         return (fingerprint(self.lens), how, pixel, wavelengths, vergences, shape, str(like.dtype), str(like.device))
 
@@ -258,261 +294,23 @@ class Imaging(Stage):
         # a bank of PSFs for as many layers as fit into a quarter of the memory
         per_layer = bands * window[0] * window[1] * planes.element_size()
         length = max(1, int(self.max_memory / 4 // per_layer))
-        layers = _Layers(planes, shares)
+        layers = _Layers(planes, shares, occlusion=self.occlusion)
         for start in range(0, vergences.numel(), length):
             some = vergences[start : start + length]
             psfs = self.psf_bank(scene.wavelengths, vergences=some, shape=window, like=planes)
-            renderer = _Renderer(self, psfs, spectra=spectra, weights=weights, picture=(height, width))
+            renderer = Renderer(
+                psfs,
+                spectra=spectra,
+                weights=weights,
+                picture=(height, width),
+                border=self.border,
+                direct=self.direct,
+                tile=self.tile,
+                max_memory=self.max_memory,
+                cache=self._transfer_cache,
+            )
             layers.add(renderer, first=start)
         return layers.light
-
-
-class _Renderer:
-    """Convolves pictures with a bank of PSFs (Z, L, h, w), contracted to the channels."""
-
-    def __init__(
-        self,
-        imaging: Imaging,
-        psfs: Tensor,
-        *,
-        spectra: Tensor | None,
-        weights: Tensor | None,
-        picture: tuple[int, int],
-    ) -> None:
-        self.imaging, self.psfs, self.spectra, self.weights = imaging, psfs, spectra, weights
-        after = imaging.border != "zero"  # zeros may share their place with those before the picture
-        window = (psfs.shape[-2], psfs.shape[-1])
-        rows, columns = (fast_length(n + (m - 1 if after else m // 2)) for n, m in zip(picture, window, strict=True))
-        size = (rows, columns)
-        plane = 4 * size[0] * size[1] * psfs.element_size()
-        self.plan = _Convolution(
-            picture=picture,
-            window=window,
-            border=imaging.border,
-            size=size,
-            bands=max(1, min(_BANDS_AT_ONCE, int(imaging.max_memory // plane))),
-        )
-
-    def blur(self, planes: Tensor, *, layer: int) -> Tensor:
-        """The scene's planes (B, K, H, W) through the PSFs of one layer: (B, C, H, W)."""
-        psfs = self.psfs[layer]
-        if self.weights is None:
-            return self._per_band(planes, psfs)
-        if self.spectra is not None and self.weights.shape[0] * self.spectra.shape[0] <= psfs.shape[0]:
-            return self._by_kernels(planes, psfs, self.weights, self.spectra)
-        kept = self._kept(psfs, (), lambda: self.plan.transfer(psfs))
-        return _Contraction.apply(planes, psfs, self.spectra, self.weights, kept, self.plan)
-
-    def coverage(self, share: Tensor, *, layer: int) -> Tensor:
-        """How a layer's mask (B, 1, H, W) spreads in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
-        psfs = self.psfs[layer]
-        kernels = psfs if self.weights is None else torch.einsum("cl,lyx->cyx", self.weights, psfs)
-        kernels = kernels / kernels.sum((-2, -1), keepdim=True)
-        return self.plan.back(self.plan.transform(share) * self.plan.transfer(kernels))
-
-    def _per_band(self, planes: Tensor, psfs: Tensor) -> Tensor:
-        """Each band by itself, for a sensor that sees all bands."""
-
-        def band(planes: Tensor, psf: Tensor, index: int) -> Tensor:
-            plane = (
-                planes[:, index]
-                if self.spectra is None
-                else torch.einsum("bkhw,k->bhw", planes, self.spectra[:, index])
-            )
-            return self.plan.back(self.plan.transform(plane) * self.plan.transfer(psf))
-
-        # between the forward and the backward pass only the results are kept, not 28 spectra
-        bands = (
-            checkpoint(band, planes, psfs[i], i, use_reentrant=False)
-            if torch.is_grad_enabled()
-            else band(planes, psfs[i], i)
-            for i in range(psfs.shape[0])
-        )
-        return torch.stack(list(bands), dim=1)
-
-    def _by_kernels(self, planes: Tensor, psfs: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
-        """sum_k (sum_l kappa_cl S_kl h_l) * C_k: for few channels and planes the PSFs are contracted, not the
-        spectra.
-        """
-
-        def transfers() -> Tensor:
-            return self.plan.transfer(torch.einsum("cl,kl,lyx->ckyx", weights, spectra, psfs))
-
-        kept = self._kept(psfs, (weights, spectra), transfers)
-        spectrum = self.plan.transform(planes)
-        channels = transfers() if kept is None else kept
-        return torch.stack([self.plan.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
-
-    def _kept(self, psfs: Tensor, others: tuple[Tensor, ...], build: Callable[[], Tensor]) -> Tensor | None:
-        """Transfer functions kept between calls while what they come from is the same, or None: too large, or
-        training.
-        """
-        count = psfs.shape[0] if not others else others[0].shape[0] * others[1].shape[0]
-        size = count * self.plan.size[0] * self.plan.size[1] * psfs.element_size()
-        trained = any(t.requires_grad for t in (psfs, *others))
-        if trained or self.psfs.shape[0] > 1 or size > self.imaging.max_memory / 4:
-            return None
-        return self.imaging._transfer_cache.get((psfs, *others, self.plan.size), build)
-
-
-@dataclass(frozen=True)
-class _Convolution:
-    """Sizes of a convolution by FFT, and its parts.
-
-    The picture is upright, which turns the PSF by 180 degrees: a correlation, so transfer functions are conjugated,
-    and the window's origin needs no shift: the picture is extended by window // 2 before its first pixel.
-    """
-
-    picture: tuple[int, int]
-    window: tuple[int, int]
-    border: str
-    size: tuple[int, int]
-    bands: int  # at once
-
-    def transform(self, planes: Tensor) -> Tensor:
-        """Spectrum of planes (..., H, W) with their border."""
-        return torch.fft.rfft2(_extend(planes, self.window, self.border), s=self.size)
-
-    def transfer(self, kernels: Tensor) -> Tensor:
-        """Conjugate transfer functions of kernels (..., h, w)."""
-        along_x = torch.fft.rfft(kernels, n=self.size[1])  # only the kernel's own rows, before the zero rows
-        # conjugated in memory: a lazy conjugate would be copied at every product
-        return torch.fft.fft(along_x, n=self.size[0], dim=-2).conj_physical_()
-
-    def back(self, spectrum: Tensor) -> Tensor:
-        """The picture of a spectrum."""
-        return torch.fft.irfft2(spectrum, s=self.size)[..., : self.picture[0], : self.picture[1]]
-
-
-class _Contraction(torch.autograd.Function):
-    """sum_l kappa_cl H_l (sum_k S_kl C_k), a few bands at a time in one small buffer; nothing but the inputs is kept.
-
-    All bands at once would take hundreds of megabytes, and most of the time would go into touching them first.
-    """
-
-    @staticmethod
-    def forward(ctx, planes, psfs, spectra, weights, kept, plan):
-        ctx.save_for_backward(planes, psfs, spectra, weights, kept)
-        ctx.plan = plan
-        batch, bands, channels = planes.shape[0], psfs.shape[0], weights.shape[0]
-        factors = None if spectra is None else plan.transform(planes)
-        result = []
-        for b in range(batch):
-            total = planes.new_zeros(channels, 2 * plan.size[0] * (plan.size[1] // 2 + 1))
-            buffer = planes.new_empty(plan.bands, plan.size[0], plan.size[1] // 2 + 1, 2)
-            for start in range(0, bands, plan.bands):
-                part = range(start, min(start + plan.bands, bands))
-                for slot, index in enumerate(part):
-                    spectrum = _band_spectrum(plan, planes, spectra, factors, b, index)
-                    transfer = _band_transfer(plan, psfs, kept, index)
-                    torch.mul(spectrum, transfer, out=torch.view_as_complex(buffer[slot]))
-                total.addmm_(weights[:, part.start : part.stop], buffer[: len(part)].flatten(1))
-            result.append(plan.back(torch.view_as_complex(total.view(channels, plan.size[0], -1, 2))))
-        return torch.stack(result)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        planes, psfs, spectra, weights, kept = ctx.saved_tensors
-        plan = ctx.plan
-        need_planes, need_psfs, need_spectra, need_weights = ctx.needs_input_grad[:4]
-        height, width = plan.window
-        factors = None if spectra is None else plan.transform(planes)
-        d_planes = torch.zeros_like(planes) if need_planes else None
-        d_factors = torch.zeros_like(factors) if need_planes and spectra is not None else None
-        d_psfs = torch.zeros_like(psfs) if need_psfs else None
-        d_spectra = torch.zeros_like(spectra) if need_spectra and spectra is not None else None
-        d_weights = torch.zeros_like(weights) if need_weights else None
-        with full_precision(grad.device):
-            for b in range(planes.shape[0]):
-                # the adjoint of cropping is a picture with nothing around it; of a correlation, a convolution
-                onto = torch.fft.rfft2(grad[b], s=plan.size)
-                flat = torch.view_as_real(onto).flatten(1)
-                for index in range(psfs.shape[0]):
-                    mixed = (weights[:, index] @ flat).view(*onto.shape[1:], 2)
-                    mixed = torch.view_as_complex(mixed)
-                    transfer = _band_transfer(plan, psfs, kept, index)
-                    if need_planes or need_spectra:
-                        d_band = mixed * transfer.conj()
-                        if spectra is None and need_planes:
-                            extended = torch.fft.irfft2(d_band, s=plan.size)
-                            d_planes[b, index] = _extend_adjoint(extended, plan)
-                        if d_factors is not None:
-                            d_factors[b].add_(spectra[:, index, None, None] * d_band)
-                        if d_spectra is not None:
-                            d_spectra[:, index] += _inner(factors[b], d_band, plan)
-                    if need_psfs or need_weights:
-                        spectrum = _band_spectrum(plan, planes, spectra, factors, b, index)
-                        if need_psfs:
-                            d_psf = torch.fft.irfft2(spectrum * mixed.conj(), s=plan.size)
-                            d_psfs[index] += d_psf[:height, :width]
-                        if need_weights:
-                            d_weights[:, index] += _inner(onto, spectrum * transfer, plan)
-            if d_factors is not None:
-                d_planes = _extend_adjoint(torch.fft.irfft2(d_factors, s=plan.size), plan)
-        return d_planes, d_psfs, d_spectra, d_weights, None, None
-
-
-def _band_spectrum(
-    plan: _Convolution, planes: Tensor, spectra: Tensor | None, factors: Tensor | None, b: int, index: int
-) -> Tensor:
-    if spectra is None or factors is None:
-        return plan.transform(planes[b, index])
-    mixed = spectra[:, index] @ torch.view_as_real(factors[b]).flatten(1)
-    return torch.view_as_complex(mixed.view(*factors.shape[2:], 2))
-
-
-def _band_transfer(plan: _Convolution, psfs: Tensor, kept: Tensor | None, index: int) -> Tensor:
-    return plan.transfer(psfs[index]) if kept is None else kept[index]
-
-
-def _inner(a: Tensor, b: Tensor, plan: _Convolution) -> Tensor:
-    """Sum over the picture's plane of two real functions, from their half spectra (C, ...) and (...), by Parseval."""
-    product = a.real * b.real + a.imag * b.imag
-    double = product.new_full((product.shape[-1],), 2.0)
-    double[0] = 1.0
-    if plan.size[1] % 2 == 0:
-        double[-1] = 1.0
-    return (product * double).sum((-2, -1)) / (plan.size[0] * plan.size[1])
-
-
-def _extend_adjoint(extended: Tensor, plan: _Convolution) -> Tensor:
-    """Transpose of `_extend` and of the zeros up to the transform's length: fold the border back onto the picture."""
-    for dim, n, m in zip((-2, -1), plan.picture, plan.window, strict=True):
-        before, after = m // 2, (m - 1) // 2
-        if plan.border == "zero":
-            extended = extended.narrow(dim, before, n)
-            continue
-        index = _border_index(torch.arange(-before, n + after, device=extended.device), n, plan.border)
-        shape = list(extended.shape)
-        shape[dim] = n
-        used = extended.narrow(dim, 0, n + before + after)
-        extended = extended.new_zeros(shape).index_add_(dim, index, used)
-    return extended
-
-
-def _extend(planes: Tensor, window: tuple[int, int], border: str) -> Tensor:
-    """The picture with the border that the window reaches: window // 2 before, the rest after."""
-    for dim, m in zip((-2, -1), window, strict=True):
-        n = planes.shape[dim]
-        before, after = m // 2, (m - 1) // 2
-        if border == "zero":
-            pad = (0, 0, before, 0) if dim == -2 else (before, 0)
-            planes = torch.nn.functional.pad(planes, pad)
-            continue
-        index = torch.arange(-before, n + after, device=planes.device)
-        planes = planes.index_select(dim, _border_index(index, n, border))
-    return planes
-
-
-def _border_index(index: Tensor, n: int, border: str) -> Tensor:
-    """Which pixel stands at each position beyond the picture; reflections repeat where the window is larger."""
-    if border == "replicate" or n == 1:
-        return index.clamp(0, n - 1)
-    if border == "periodic":
-        return index % n
-    folded = index % (2 * n - 2)
-    return torch.where(folded < n, folded, 2 * n - 2 - folded)
 
 
 class _Layers:
@@ -524,15 +322,16 @@ class _Layers:
     with K the PSFs weighted by the channel's filter, relative to their own sum: coverage per *channel*, so that the
     sum over wavelengths stays inside the transform. Dividing by E_k extends each layer behind the nearer ones, whose
     blurred edge would otherwise show black. Where all layers share one PSF this is exactly the plain convolution.
+    Without occlusion the layers are added up as they are.
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
     """
 
-    def __init__(self, planes: Tensor, shares: Tensor | None) -> None:
-        self.planes, self.shares = planes, shares
+    def __init__(self, planes: Tensor, shares: Tensor | None, *, occlusion: bool) -> None:
+        self.planes, self.shares, self.occlusion = planes, shares, occlusion
         self.light: Tensor = planes.new_zeros(())
         self._covered: Tensor = planes.new_zeros(())
 
-    def add(self, renderer: _Renderer, *, first: int) -> None:
+    def add(self, renderer: Renderer, *, first: int) -> None:
         """Lay the layers of one bank of PSFs, `first` and the following, over those before."""
         if self.shares is None:
             self.light = renderer.blur(self.planes, layer=0)
@@ -540,6 +339,9 @@ class _Layers:
         for layer in range(renderer.psfs.shape[0]):
             share = self.shares[:, first + layer : first + layer + 1]
             light = renderer.blur(self.planes * share, layer=layer)
+            if not self.occlusion:
+                self.light = self.light + light
+                continue
             cover = renderer.coverage(share, layer=layer)
             self._covered = self._covered + cover
             floor = self._covered.clamp(min=_COVERAGE_FLOOR)

@@ -778,7 +778,7 @@ BAD = [
         r"unknown border 'mirror'; known: reflect, replicate, periodic, zero",
     ),
     (lambda: imaging(layers=0), ValueError, r"layers must be a positive number of depth layers, or None, got 0"),
-    (lambda: imaging(bands=0), ValueError, r"bands must be a positive number of wavelengths, or None for all, got 0"),
+    (lambda: imaging(bands=0), ValueError, r"bands must be a positive number of wavelengths, or None, got 0"),
     (lambda: imaging(distance=-1.0), ValueError, r"distance -1 is not a distance in front of the lens"),
     (lambda: imaging(max_memory=0), ValueError, r"max_memory must be a positive number of bytes, got 0"),
     (lambda: imaging(fill_factor=0.0), ValueError, r"fill_factor 0 must be in \(0, 1\]"),
@@ -812,19 +812,19 @@ def test_provides_its_optics() -> None:
 @pytest.mark.parametrize("factors", [None, 5])
 def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: int | None) -> None:
     """To the planes, the PSFs, the scene's spectra and the filter: the hand-written adjoint against differences."""
-    from kcam.optics.imaging import _Contraction, _Convolution
+    from kcam.optics.convolution import Contraction, Convolution
     from kcam.optics.transforms import fast_length
 
     picture, window = (5, 6), (4, 9)  # an even window, and one wider than the picture
     size = tuple(fast_length(n + m) for n, m in zip(picture, window, strict=True))
-    plan = _Convolution(picture=picture, window=window, border=border, size=size, bands=2)
+    plan = Convolution(picture=picture, window=window, border=border, size=size, bands=2)
     planes = random(2, 3 if factors is None else factors, *picture).requires_grad_()
     psfs = random(3, *window, seed=7).requires_grad_()
     weights = random(2, 3, seed=8).requires_grad_()
     spectra = None if factors is None else random(factors, 3, seed=9).requires_grad_()
 
     def contract(planes: Tensor, psfs: Tensor, weights: Tensor, *spectra: Tensor) -> Tensor:
-        return _Contraction.apply(planes, psfs, spectra[0] if spectra else None, weights, None, plan)
+        return Contraction.apply(planes, psfs, spectra[0] if spectra else None, weights, None, plan)
 
     inputs = (planes, psfs, weights) if spectra is None else (planes, psfs, weights, spectra)
     assert torch.autograd.gradcheck(contract, inputs)

@@ -1,0 +1,340 @@
+"""Convolution of pictures with banks of PSFs by FFT, contracted to a sensor's channels before the way back.
+
+    I_c = sum_l kappa_cl (I_l * h_l),   I_l = sum_k S_kl C_k
+
+The sum over wavelengths stands *inside* the Fourier transform: the picture is transformed once per plane of the scene's
+factors, and back once per channel, not once per band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from kcam.cache import ValueCache
+from kcam.optics.transforms import fast_length
+from kcam.precision import full_precision
+
+BORDERS = ("reflect", "replicate", "periodic", "zero")
+_BANDS_AT_ONCE = 4  # at most, in the buffer of a contraction: small enough to stay in the processor's cache
+
+
+class Renderer:
+    """Convolves pictures (B, K, H, W) with a bank of PSFs (Z, L, h, w), contracted to the channels.
+
+    Args:
+        spectra: (K, L) of the planes, or None where the planes are the bands.
+        weights: (C, L) of the channels, or None for all bands.
+        picture: (H, W). border: what lies beyond it, one of `BORDERS`.
+        direct: sum over the window in the picture instead of by FFT; with the same result, faster for small windows.
+        tile: side of the squares that the picture is cut into [pixels], or None; with the same result, in less memory.
+        max_memory: bytes that the transforms may take. cache: for transfer functions, while the optics stay.
+    """
+
+    def __init__(
+        self,
+        psfs: Tensor,
+        *,
+        spectra: Tensor | None,
+        weights: Tensor | None,
+        picture: tuple[int, int],
+        border: str = "reflect",
+        direct: bool = False,
+        tile: int | None = None,
+        max_memory: float = 2e9,
+        cache: ValueCache | None = None,
+    ) -> None:
+        self.psfs, self.spectra, self.weights = psfs, spectra, weights
+        self.picture, self.border, self.direct, self.tile = picture, border, direct, tile
+        self.max_memory, self.cache = max_memory, cache
+        self.window = (psfs.shape[-2], psfs.shape[-1])
+        tiled = tile is not None and tile < max(picture)
+        part = (min(tile, picture[0]), min(tile, picture[1])) if tile is not None else picture
+        self.convolution = Convolution.of(
+            part, self.window, border="given" if tiled else border, itemsize=psfs.element_size(), max_memory=max_memory
+        )
+
+    def blur(self, planes: Tensor, *, layer: int) -> Tensor:
+        """The scene's planes (B, K, H, W) through the PSFs of one layer: (B, C, H, W)."""
+        return self._tiles(planes, self._blur(self.psfs[layer]))
+
+    def coverage(self, share: Tensor, *, layer: int) -> Tensor:
+        """How a layer's mask (B, 1, H, W) spreads in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
+        psfs = self.psfs[layer]
+        kernels = psfs if self.weights is None else torch.einsum("cl,lyx->cyx", self.weights, psfs)
+        kernels = kernels / kernels.sum((-2, -1), keepdim=True)
+        if self.direct:
+            return torch.nn.functional.conv2d(extend(share, self.window, self.border), kernels[:, None])
+        transfers = self.convolution.transfer(kernels)
+        return self._tiles(share, lambda part: self.convolution.back(self.convolution.transform(part) * transfers))
+
+    def _tiles(self, planes: Tensor, blur: Callable[[Tensor], Tensor]) -> Tensor:
+        """The picture in squares, each with what the window reaches around it; or whole."""
+        if self.direct or self.convolution.border != "given":
+            return blur(planes)
+        (height, width), (rows, columns), (h, w) = self.picture, self.convolution.picture, self.window
+        down, across = -(-height // rows), -(-width // columns)
+        extended = extend(planes, self.window, self.border)
+        pad = (0, across * columns + w - 1 - extended.shape[-1], 0, down * rows + h - 1 - extended.shape[-2])
+        extended = torch.nn.functional.pad(extended, pad)
+        parts = [
+            [
+                blur(extended[..., i * rows : (i + 1) * rows + h - 1, j * columns : (j + 1) * columns + w - 1])
+                for j in range(across)
+            ]
+            for i in range(down)
+        ]
+        return torch.cat([torch.cat(row, dim=-1) for row in parts], dim=-2)[..., :height, :width]
+
+    def _blur(self, psfs: Tensor) -> Callable[[Tensor], Tensor]:
+        """What one layer's PSFs do to planes; what does not depend on the planes is computed here, once."""
+        weights, spectra, convolution = self.weights, self.spectra, self.convolution
+        if self.direct:
+            return lambda planes: self._in_picture(planes, psfs)
+        if weights is None:
+            return lambda planes: self._per_band(planes, psfs)
+        if spectra is not None and weights.shape[0] * spectra.shape[0] <= psfs.shape[0]:
+            # for few channels and planes the PSFs are contracted, not the spectra: sum_k (sum_l kappa_cl S_kl h_l) C_k
+            channels = self._transfers(
+                weights.shape[0] * spectra.shape[0],
+                lambda: convolution.transfer(torch.einsum("cl,kl,lyx->ckyx", weights, spectra, psfs)),
+                psfs,
+                weights,
+                spectra,
+            )
+
+            def by_kernels(planes: Tensor) -> Tensor:
+                spectrum = convolution.transform(planes)
+                return torch.stack([convolution.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
+
+            return by_kernels
+        count, kept = psfs.shape[0], None
+        if self._keeps(count, psfs):
+            kept = self._transfers(count, lambda: convolution.transfer(psfs), psfs)
+        return lambda planes: Contraction.apply(planes, psfs, spectra, weights, kept, convolution)
+
+    def _in_picture(self, planes: Tensor, psfs: Tensor) -> Tensor:
+        """Correlation without a transform. The picture is upright, so the PSF is turned: what conv2d does."""
+        if self.weights is None:
+            bands = planes if self.spectra is None else torch.einsum("bkhw,kl->blhw", planes, self.spectra)
+            extended = extend(bands, self.window, self.border)
+            return torch.nn.functional.conv2d(extended, psfs[:, None], groups=psfs.shape[0])
+        if self.spectra is None:
+            kernels = self.weights[:, :, None, None] * psfs
+        else:
+            kernels = torch.einsum("cl,kl,lyx->ckyx", self.weights, self.spectra, psfs)
+        return torch.nn.functional.conv2d(extend(planes, self.window, self.border), kernels)
+
+    def _per_band(self, planes: Tensor, psfs: Tensor) -> Tensor:
+        """Each band by itself, for a sensor that sees all bands."""
+
+        def band(planes: Tensor, psf: Tensor, index: int) -> Tensor:
+            plane = (
+                planes[:, index]
+                if self.spectra is None
+                else torch.einsum("bkhw,k->bhw", planes, self.spectra[:, index])
+            )
+            return self.convolution.back(self.convolution.transform(plane) * self.convolution.transfer(psf))
+
+        # between the forward and the backward pass only the results are kept, not 28 spectra
+        bands = (
+            checkpoint(band, planes, psfs[i], i, use_reentrant=False)
+            if torch.is_grad_enabled()
+            else band(planes, psfs[i], i)
+            for i in range(psfs.shape[0])
+        )
+        return torch.stack(list(bands), dim=1)
+
+    def _keeps(self, count: int, *sources: Tensor) -> bool:
+        """Whether so many transfer functions are kept between calls: while they fit, and nothing is trained."""
+        size = count * self.convolution.size[0] * self.convolution.size[1] * self.psfs.element_size()
+        trained = any(t.requires_grad for t in sources)
+        return not trained and self.psfs.shape[0] == 1 and size <= self.max_memory / 4
+
+    def _transfers(self, count: int, build: Callable[[], Tensor], *sources: Tensor) -> Tensor:
+        """Transfer functions, kept while what they come from is the same."""
+        if self.cache is None or not self._keeps(count, *sources):
+            return build()
+        return self.cache.get((*sources, self.convolution.size), build)
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """Sizes of a convolution by FFT, and its parts.
+
+    The picture is upright, which turns the PSF by 180 degrees: a correlation, so transfer functions are conjugated,
+    and the window's origin needs no shift: the picture is extended by window // 2 before its first pixel.
+    """
+
+    picture: tuple[int, int]
+    window: tuple[int, int]
+    border: str  # one of BORDERS, or "given": the planes come with what lies around them
+    size: tuple[int, int]
+    bands: int  # at once
+
+    @classmethod
+    def of(
+        cls, picture: tuple[int, int], window: tuple[int, int], *, border: str, itemsize: int, max_memory: float
+    ) -> Convolution:
+        """Fast lengths for a picture and a window, and as many bands at once as are fast and fit."""
+        after = border != "zero"  # zeros may share their place with those before the picture
+        rows, columns = (fast_length(n + (m - 1 if after else m // 2)) for n, m in zip(picture, window, strict=True))
+        bands = max(1, min(_BANDS_AT_ONCE, int(max_memory // (4 * rows * columns * itemsize))))
+        return cls(picture, window, border, (rows, columns), bands)
+
+    def transform(self, planes: Tensor) -> Tensor:
+        """Spectrum of planes (..., H, W) with their border."""
+        if self.border == "given":
+            return torch.fft.rfft2(planes, s=self.size)
+        return torch.fft.rfft2(extend(planes, self.window, self.border, zeros_after=False), s=self.size)
+
+    def transfer(self, kernels: Tensor) -> Tensor:
+        """Conjugate transfer functions of kernels (..., h, w)."""
+        along_x = torch.fft.rfft(kernels, n=self.size[1])  # only the kernel's own rows, before the zero rows
+        # conjugated in memory: a lazy conjugate would be copied at every product
+        return torch.fft.fft(along_x, n=self.size[0], dim=-2).conj_physical_()
+
+    def back(self, spectrum: Tensor) -> Tensor:
+        """The picture of a spectrum."""
+        return torch.fft.irfft2(spectrum, s=self.size)[..., : self.picture[0], : self.picture[1]]
+
+
+class Contraction(torch.autograd.Function):
+    """sum_l kappa_cl H_l (sum_k S_kl C_k), a few bands at a time in one small buffer; nothing but the inputs is kept.
+
+    All bands at once would take hundreds of megabytes, and most of the time would go into touching them first.
+    """
+
+    @staticmethod
+    def forward(ctx, planes, psfs, spectra, weights, kept, convolution):
+        ctx.save_for_backward(planes, psfs, spectra, weights, kept)
+        ctx.convolution = convolution
+        batch, bands, channels = planes.shape[0], psfs.shape[0], weights.shape[0]
+        factors = None if spectra is None else convolution.transform(planes)
+        result = []
+        for b in range(batch):
+            total = planes.new_zeros(channels, 2 * convolution.size[0] * (convolution.size[1] // 2 + 1))
+            buffer = planes.new_empty(convolution.bands, convolution.size[0], convolution.size[1] // 2 + 1, 2)
+            for start in range(0, bands, convolution.bands):
+                part = range(start, min(start + convolution.bands, bands))
+                for slot, index in enumerate(part):
+                    spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
+                    transfer = _band_transfer(convolution, psfs, kept, index)
+                    torch.mul(spectrum, transfer, out=torch.view_as_complex(buffer[slot]))
+                total.addmm_(weights[:, part.start : part.stop], buffer[: len(part)].flatten(1))
+            result.append(convolution.back(torch.view_as_complex(total.view(channels, convolution.size[0], -1, 2))))
+        return torch.stack(result)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        planes, psfs, spectra, weights, kept = ctx.saved_tensors
+        convolution = ctx.convolution
+        need_planes, need_psfs, need_spectra, need_weights = ctx.needs_input_grad[:4]
+        height, width = convolution.window
+        factors = None if spectra is None else convolution.transform(planes)
+        d_planes = torch.zeros_like(planes) if need_planes else None
+        d_factors = torch.zeros_like(factors) if need_planes and spectra is not None else None
+        d_psfs = torch.zeros_like(psfs) if need_psfs else None
+        d_spectra = torch.zeros_like(spectra) if need_spectra and spectra is not None else None
+        d_weights = torch.zeros_like(weights) if need_weights else None
+        with full_precision(grad.device):
+            for b in range(planes.shape[0]):
+                # the adjoint of cropping is a picture with nothing around it; of a correlation, a convolution
+                onto = torch.fft.rfft2(grad[b], s=convolution.size)
+                flat = torch.view_as_real(onto).flatten(1)
+                for index in range(psfs.shape[0]):
+                    mixed = (weights[:, index] @ flat).view(*onto.shape[1:], 2)
+                    mixed = torch.view_as_complex(mixed)
+                    transfer = _band_transfer(convolution, psfs, kept, index)
+                    if need_planes or need_spectra:
+                        d_band = mixed * transfer.conj()
+                        if spectra is None and need_planes:
+                            extended = torch.fft.irfft2(d_band, s=convolution.size)
+                            d_planes[b, index] = extend_adjoint(extended, convolution)
+                        if d_factors is not None:
+                            d_factors[b].add_(spectra[:, index, None, None] * d_band)
+                        if d_spectra is not None:
+                            d_spectra[:, index] += _inner(factors[b], d_band, convolution)
+                    if need_psfs or need_weights:
+                        spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
+                        if need_psfs:
+                            d_psf = torch.fft.irfft2(spectrum * mixed.conj(), s=convolution.size)
+                            d_psfs[index] += d_psf[:height, :width]
+                        if need_weights:
+                            d_weights[:, index] += _inner(onto, spectrum * transfer, convolution)
+            if d_factors is not None:
+                d_planes = extend_adjoint(torch.fft.irfft2(d_factors, s=convolution.size), convolution)
+        return d_planes, d_psfs, d_spectra, d_weights, None, None
+
+
+def _band_spectrum(
+    convolution: Convolution, planes: Tensor, spectra: Tensor | None, factors: Tensor | None, b: int, index: int
+) -> Tensor:
+    if spectra is None or factors is None:
+        return convolution.transform(planes[b, index])
+    mixed = spectra[:, index] @ torch.view_as_real(factors[b]).flatten(1)
+    return torch.view_as_complex(mixed.view(*factors.shape[2:], 2))
+
+
+def _band_transfer(convolution: Convolution, psfs: Tensor, kept: Tensor | None, index: int) -> Tensor:
+    return convolution.transfer(psfs[index]) if kept is None else kept[index]
+
+
+def _inner(a: Tensor, b: Tensor, convolution: Convolution) -> Tensor:
+    """Sum over the picture's plane of two real functions, from their half spectra (C, ...) and (...), by Parseval."""
+    product = a.real * b.real + a.imag * b.imag
+    double = product.new_full((product.shape[-1],), 2.0)
+    double[0] = 1.0
+    if convolution.size[1] % 2 == 0:
+        double[-1] = 1.0
+    return (product * double).sum((-2, -1)) / (convolution.size[0] * convolution.size[1])
+
+
+def extend_adjoint(extended: Tensor, convolution: Convolution) -> Tensor:
+    """Transpose of `extend` and of the zeros up to the transform's length: fold the border back onto the picture."""
+    for dim, n, m in zip((-2, -1), convolution.picture, convolution.window, strict=True):
+        before, after = m // 2, (m - 1) // 2
+        if convolution.border == "given":
+            extended = extended.narrow(dim, 0, n + before + after)
+            continue
+        if convolution.border == "zero":
+            extended = extended.narrow(dim, before, n)
+            continue
+        index = _border_index(torch.arange(-before, n + after, device=extended.device), n, convolution.border)
+        shape = list(extended.shape)
+        shape[dim] = n
+        used = extended.narrow(dim, 0, n + before + after)
+        extended = extended.new_zeros(shape).index_add_(dim, index, used)
+    return extended
+
+
+def extend(planes: Tensor, window: tuple[int, int], border: str, *, zeros_after: bool = True) -> Tensor:
+    """The picture with the border that the window reaches: window // 2 before, the rest after.
+
+    zeros_after: False leaves them out where the border is zero, for a transform that appends zeros itself.
+    """
+    for dim, m in zip((-2, -1), window, strict=True):
+        n = planes.shape[dim]
+        before, after = m // 2, (m - 1) // 2
+        if border == "zero":
+            ends = (before, after if zeros_after else 0)
+            planes = torch.nn.functional.pad(planes, (0, 0, *ends) if dim == -2 else ends)
+            continue
+        index = torch.arange(-before, n + after, device=planes.device)
+        planes = planes.index_select(dim, _border_index(index, n, border))
+    return planes
+
+
+def _border_index(index: Tensor, n: int, border: str) -> Tensor:
+    """Which pixel stands at each position beyond the picture; reflections repeat where the window is larger."""
+    if border == "replicate" or n == 1:
+        return index.clamp(0, n - 1)
+    if border == "periodic":
+        return index % n
+    folded = index % (2 * n - 2)
+    return torch.where(folded < n, folded, 2 * n - 2 - folded)

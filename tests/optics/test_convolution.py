@@ -1,0 +1,130 @@
+"""The ways to convolve give one result, and each shortcut of Imaging errs as its definition says."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcam import optics
+from kcam.context import Context
+from kcam.optics.convolution import BORDERS, Renderer
+from kcam.scene import Scene
+from kcam.sensor import ColourFilter
+from kcam.units import mm, um, wavelength_grid
+
+WAYS = {"direct": {"direct": True}, "tiles": {"tile": 8}, "one tile": {"tile": 64}, "odd tiles": {"tile": 13}}
+CONTENTS = {"bands": (None, None), "filter": (None, 2), "kernels": (2, 2), "spectra": (5, 2), "planes": (5, None)}
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def imaging(**arguments) -> optics.Imaging:
+    lens = optics.Lens(
+        optics.CircularAperture(2.5 * mm), optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"), focus_distance=2.0
+    )
+    return optics.Imaging(lens, **({"pixel_pitch": 4 * um} | arguments))
+
+
+def ramp(*, near: float = 0.8, far: float = 3.0, size: tuple[int, int] = (24, 30)) -> Scene:
+    depth = torch.linspace(near, far, size[1], dtype=torch.float64).expand(1, 1, *size)
+    return Scene.from_rgb(random(1, 3, *size), depth=depth, wavelengths=wavelength_grid(count=6))
+
+
+def rms(a: Tensor, b: Tensor) -> float:
+    return float((a - b).square().mean().sqrt() / b.square().mean().sqrt())
+
+
+@pytest.mark.parametrize("border", BORDERS)
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("content", CONTENTS)
+def test_every_way_gives_the_same_result_and_gradients(content: str, way: str, border: str) -> None:
+    factors, channels = CONTENTS[content]
+    picture, window, bands = (21, 18), (6, 9), 5
+    spectra = None if factors is None else random(factors, bands, seed=3)
+    weights = None if channels is None else random(channels, bands, seed=4)
+    results = []
+    for arguments in ({}, WAYS[way]):
+        planes = random(2, factors or bands, *picture, seed=1).requires_grad_()
+        psfs = random(1, bands, *window, seed=2).requires_grad_()
+        mask = random(2, 1, *picture, seed=6)
+        renderer = Renderer(psfs, spectra=spectra, weights=weights, picture=picture, border=border, **arguments)
+        light, cover = renderer.blur(planes, layer=0), renderer.coverage(mask, layer=0)
+        loss = (light * random(*light.shape, seed=5)).sum()
+        results.append((light, cover, *torch.autograd.grad(loss, (planes, psfs))))
+    for found, expected in zip(results[1], results[0], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_every_way_renders_layers(way: str) -> None:
+    scene, colours = ramp(), ColourFilter.kodak()
+    whole = imaging()(scene, colour_filter=colours)
+    assert rms(imaging(**WAYS[way])(scene, colour_filter=colours), whole) < 1e-12
+
+
+def test_without_blur_the_picture_is_the_scene() -> None:
+    scene = ramp()
+    assert rms(imaging(blur=False)(scene), scene.bands()) < 1e-15
+    colours = ColourFilter.kodak()
+    context = Context(wavelengths=scene.wavelengths)
+    assert rms(imaging(blur=False)(scene, colour_filter=colours), colours(scene.bands(), context)) < 1e-12
+
+
+def test_a_renormalised_psf_has_all_its_light() -> None:
+    scene = Scene.from_bands(torch.ones(1, 3, 20, 20, dtype=torch.float64), wavelengths=wavelength_grid(count=3))
+    cut = imaging(psf_shape=(5, 5))(scene)
+    whole = imaging(psf_shape=(5, 5), renormalise=True)(scene)
+    assert float(cut.max()) < 0.99
+    assert rms(whole, torch.ones_like(whole)) < 1e-12
+
+
+def test_without_occlusion_layers_add_up() -> None:
+    """Far light that a near edge would hide is counted: more light, none lost, and nothing changes on one plane."""
+    depth = torch.full((1, 1, 24, 30), 3.0, dtype=torch.float64)
+    depth[..., 15:] = 0.8
+    planes = torch.ones(1, 3, 24, 30, dtype=torch.float64)
+    scene = Scene.from_rgb(planes, depth=depth, wavelengths=wavelength_grid(count=4))
+    hidden, added = imaging()(scene), imaging(occlusion=False)(scene)
+    assert 1e-3 < rms(added, hidden) < 0.2
+    flat = scene.with_depth(1.1)
+    assert torch.equal(imaging()(flat), imaging(occlusion=False)(flat))
+
+
+def test_precision_follows_the_argument_and_the_dtype_stays() -> None:
+    scene = ramp()
+    single = imaging(precision="float32")(scene)
+    assert single.dtype == torch.float64
+    assert 1e-9 < rms(single, imaging()(scene)) < 1e-5
+    wide = imaging(precision="float64")(scene.to(dtype=torch.float32))
+    assert wide.dtype == torch.float32
+
+
+def test_rank_is_the_scene_s_own_low_rank() -> None:
+    scene = Scene.from_bands(random(1, 6, 20, 20), wavelengths=wavelength_grid(count=6))
+    torch.testing.assert_close(imaging(rank=2)(scene), imaging()(scene.low_rank(2)))
+    assert torch.equal(imaging(rank=6)(scene), imaging()(scene))
+
+
+def test_kappa_sets_the_pupil_sampling() -> None:
+    phase = 3 * random(12, 12)
+    rough = optics.Lens(*imaging().lens.elements, optics.DOE(phase), focus_distance=2.0)
+    scene = Scene.from_rgb(random(1, 3, 60, 60), depth=1.0, wavelengths=wavelength_grid(count=3))
+    fine, coarse = (optics.Imaging(rough, pixel_pitch=4 * um, kappa=kappa)(scene) for kappa in (5.0, 1.2))
+    assert rms(optics.Imaging(rough, pixel_pitch=4 * um)(scene), fine) < rms(coarse, fine)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"tile": 0}, "tile must be a positive number of pixels, or None, got 0"),
+        ({"rank": 0}, "rank must be a positive number of factors, or None, got 0"),
+        ({"kappa": 1.0}, "kappa must be above 1 sample per fringe, got 1. Its default is 2.7"),
+        ({"precision": "half"}, "precision must be \"float32\", \"float64\" or None for the scene's, got 'half'"),
+    ],
+)
+def test_bad_shortcuts_say_what_is_wrong(arguments: dict, text: str) -> None:
+    with pytest.raises(ValueError, match=text.replace("(", r"\(")):
+        imaging(**arguments)
