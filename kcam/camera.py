@@ -7,7 +7,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,9 @@ from kcam import files, isp, optics, sensor
 from kcam.context import Context, Stage
 from kcam.scene import Scene
 from kcam.units import mm, nm, um
+
+if TYPE_CHECKING:
+    from kcam.planner import Plan
 
 DEMOSAICING = (isp.Demosaic, isp.LearnedDemosaic)
 ORDER: tuple[type[nn.Module] | tuple[type[nn.Module], ...], ...] = (
@@ -79,14 +82,31 @@ class Camera(nn.Module):
             fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance")}
         return dataclasses.replace(self.context or Context(), **fields, generator=generator)
 
-    def forward(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    def forward(
+        self,
+        scene: Scene | Tensor,
+        *,
+        generator: torch.Generator | None = None,
+        tolerance: float | str | None = None,
+    ) -> Tensor:
         """Take a picture.
 
         Args:      scene: a Scene, or its bands (B,L,H,W) at the context's wavelengths.
                    generator: source of all noise; None for torch's default one.
+                   tolerance: None for the reference physics; else the picture is planned for afresh: see `plan`.
         Returns:   (B,C,H,W), what the last stage gives: sRGB in [0,1] from a camera that ends in ToneCurve.
-        Raises:    TypeError for anything else than a scene or a tensor, or a generator that is none.
+        Raises:    TypeError for anything else than a scene or a tensor, or a generator that is none; ValueError for a
+                   tolerance where gradients are recorded: training must not plan anew at each step.
         """
+        if tolerance is not None:
+            if torch.is_grad_enabled() and any(p.requires_grad for p in self.parameters()):
+                raise ValueError(
+                    "tolerance= plans afresh at each call, which training must not: a plan is explicit there. Use "
+                    "plan = camera.plan(scene, tolerance=...) once and plan.apply(camera)(scene), or torch.no_grad()."
+                )
+            if not isinstance(scene, Scene):
+                raise TypeError(f"tolerance= plans for a Scene, got {type(scene).__name__}. Use Scene.from_bands(...).")
+            return self.plan(scene, tolerance=tolerance).apply(self)(scene, generator=generator)
         picture: Any = scene.bands() if isinstance(scene, Scene) and not len(self) else scene
         for _, picture in self.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
             pass
@@ -137,6 +157,22 @@ class Camera(nn.Module):
     def noiseless(self) -> Camera:
         """The same camera with every random stage at its mean; it shares the parameters."""
         return Camera(*(_at_mean(stage) for stage in self), context=self.resolve())
+
+    def plan(
+        self, scenes: Scene | Sequence[Scene], *, tolerance: float | str, max_memory: float | None = None
+    ) -> Plan:
+        """What to simulate for these scenes to stay within a tolerance: `kcam.planner.make_plan`."""
+        from kcam.planner import make_plan
+
+        return make_plan(self, scenes, tolerance=tolerance, max_memory=max_memory)
+
+    def explain(
+        self, scene: Scene, *, tolerance: float | str, measure: bool = False, max_memory: float | None = None
+    ) -> Plan:
+        """The plan for a scene, and with `measure` its true error and time: `kcam.planner.explain`."""
+        from kcam.planner import explain
+
+        return explain(self, scene, tolerance=tolerance, measure=measure, max_memory=max_memory)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write weights and configuration into one .safetensors file; `kcam.files.describe` reads the latter back."""

@@ -28,7 +28,7 @@ from kcam import isp, measure, sensor
 from kcam.camera import DEMOSAICING, Camera
 from kcam.optics import PROPAGATORS, Imaging
 from kcam.optics.propagation import PHYSICS, Propagator, choose
-from kcam.optics.psf import Query, ray_displacement, samples_by_rule
+from kcam.optics.psf import Query, samples_by_rule
 from kcam.optics.reference import Convergence, checked_psf
 from kcam.optics.textbook import textbook_angular_spectrum_row, textbook_row
 from kcam.scene import Scene
@@ -388,7 +388,7 @@ def _sample_counts(imaging: Imaging, scene: Scene, kappas: Sequence[float]) -> l
     """Pupil samples that each kappa gives at the shortest wavelength, ascending."""
     query = _query(imaging, scene)
     shortest = int(query.wavelengths.argmin())
-    spread, wavelength = float(ray_displacement(query)[shortest]), float(query.wavelengths[shortest])
+    spread, wavelength = float(query.displacement[shortest]), float(query.wavelengths[shortest])
     return sorted(
         {
             samples_by_rule(replace(query, kappa=kappa, samples=None), displacement=spread, wavelength=wavelength)

@@ -162,7 +162,7 @@ def test_no_generator() -> None:
 
 def test_a_camera_prints_its_values() -> None:
     text = str(Camera.phone())
-    for part in ("ThinLens(focal_length=0.0043)", "ReadNoise(sigma_electrons=2)", "ADC(bits=10, black_level=64)"):
+    for part in ("ThinLens(focal_length=0.0043)", "ReadNoise(sigma_electrons=2)", "ADC(bits=10, black_level=64"):
         assert part in text
     assert "ShotNoise(full_well=(2, 1, 1, 1))" in str(sensor.ShotNoise(torch.ones(2, 1, 1, 1)))
     assert str(Probe()) == "Probe()"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from kcam.optics.psf import Query, ray_displacement, residual_path, to_pixels
+from kcam.optics.psf import Query, residual_path, to_pixels
 from kcam.optics.pupil import Pupil, pixel_under, round_weights, unfold_quadrant
 from kcam.optics.transforms import fast_length
 
@@ -34,7 +34,7 @@ def spectrum_grids(query: Query) -> list[tuple[int, float]]:
     """
     a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
     grids = []
-    for wavelength, spread in zip(query.wavelengths.tolist(), ray_displacement(query).tolist(), strict=True):
+    for wavelength, spread in zip(query.wavelengths.tolist(), query.displacement.tolist(), strict=True):
         # from the rim light goes to the far edge of the window, and a little further: its cycles per metre in the grid
         reach = max(query.half_window, spread)
         across = a + reach + 10 * wavelength * d / (2 * a)

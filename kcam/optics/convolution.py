@@ -8,6 +8,7 @@ factors, and back once per channel, not once per band.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from kcam.cache import ValueCache
+from kcam.effects import Work
 from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 
@@ -24,9 +26,10 @@ _BANDS_AT_ONCE = 4  # at most, in the buffer of a contraction: small enough to s
 
 
 class Renderer:
-    """Convolves pictures (B, K, H, W) with a bank of PSFs (Z, L, h, w), contracted to the channels.
+    """Convolves pictures (B, K, H, W) with a bank of PSFs (Z, G, h, w), contracted to the channels.
 
     Args:
+        owner: (L,) which of the G PSFs each band takes; None where each band has its own.
         spectra: (K, L) of the planes, or None where the planes are the bands.
         weights: (C, L) of the channels, or None for all bands.
         picture: (H, W). border: what lies beyond it, one of `BORDERS`.
@@ -42,13 +45,14 @@ class Renderer:
         spectra: Tensor | None,
         weights: Tensor | None,
         picture: tuple[int, int],
+        owner: Tensor | None = None,
         border: str = "reflect",
         direct: bool = False,
         tile: int | None = None,
         max_memory: float = 2e9,
         cache: ValueCache | None = None,
     ) -> None:
-        self.psfs, self.spectra, self.weights = psfs, spectra, weights
+        self.psfs, self.owner, self.spectra, self.weights = psfs, owner, spectra, weights
         self.picture, self.border, self.direct, self.tile = picture, border, direct, tile
         self.max_memory, self.cache = max_memory, cache
         self.window = (psfs.shape[-2], psfs.shape[-1])
@@ -64,13 +68,25 @@ class Renderer:
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How a layer's mask (B, 1, H, W) spreads in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
-        psfs = self.psfs[layer]
-        kernels = psfs if self.weights is None else torch.einsum("cl,lyx->cyx", self.weights, psfs)
+        kernels = self._of_bands(self.psfs[layer])
+        if self.weights is not None:
+            kernels = torch.einsum("cg,gyx->cyx", self._grouped(self.weights), self.psfs[layer])
         kernels = kernels / kernels.sum((-2, -1), keepdim=True)
         if self.direct:
             return torch.nn.functional.conv2d(extend(share, self.window, self.border), kernels[:, None])
         transfers = self.convolution.transfer(kernels)
         return self._tiles(share, lambda part: self.convolution.back(self.convolution.transform(part) * transfers))
+
+    def _of_bands(self, psfs: Tensor) -> Tensor:
+        """The PSF of each band, (L, h, w)."""
+        return psfs if self.owner is None else psfs[self.owner.to(psfs.device)]
+
+    def _grouped(self, weights: Tensor) -> Tensor:
+        """Weights of the bands, (..., L), added up over those that share a PSF: (..., G)."""
+        if self.owner is None:
+            return weights
+        sums = weights.new_zeros(*weights.shape[:-1], self.psfs.shape[1])
+        return sums.index_add(-1, self.owner.to(weights.device), weights)
 
     def _tiles(self, planes: Tensor, blur: Callable[[Tensor], Tensor]) -> Tensor:
         """The picture in squares, each with what the window reaches around it; or whole."""
@@ -93,44 +109,67 @@ class Renderer:
     def _blur(self, psfs: Tensor) -> Callable[[Tensor], Tensor]:
         """What one layer's PSFs do to planes; what does not depend on the planes is computed here, once."""
         weights, spectra, convolution = self.weights, self.spectra, self.convolution
-        if self.direct:
-            return lambda planes: self._in_picture(planes, psfs)
         if weights is None:
-            return lambda planes: self._per_band(planes, psfs)
-        if spectra is not None and weights.shape[0] * spectra.shape[0] <= psfs.shape[0]:
-            # for few channels and planes the PSFs are contracted, not the spectra: sum_k (sum_l kappa_cl S_kl h_l) C_k
-            channels = self._transfers(
-                weights.shape[0] * spectra.shape[0],
-                lambda: convolution.transfer(torch.einsum("cl,kl,lyx->ckyx", weights, spectra, psfs)),
-                psfs,
-                weights,
-                spectra,
-            )
-
-            def by_kernels(planes: Tensor) -> Tensor:
-                spectrum = convolution.transform(planes)
-                return torch.stack([convolution.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
-
-            return by_kernels
+            return lambda planes: self._per_band(planes, self._of_bands(psfs))
+        if spectra is not None:
+            mixing = self._grouped(weights[:, None] * spectra)  # (C, K, G)
+            if self.direct or self.owner is not None or mixing.shape[0] * mixing.shape[1] <= psfs.shape[0]:
+                return self._by_kernels(mixing, psfs)
+        elif self.direct or (self.owner is not None and weights.shape[0] * psfs.shape[0] < weights.shape[1]):
+            return self._by_groups(weights, psfs)
+        psfs = self._of_bands(psfs)
         count, kept = psfs.shape[0], None
         if self._keeps(count, psfs):
             kept = self._transfers(count, lambda: convolution.transfer(psfs), psfs)
         return lambda planes: Contraction.apply(planes, psfs, spectra, weights, kept, convolution)
 
-    def _in_picture(self, planes: Tensor, psfs: Tensor) -> Tensor:
-        """Correlation without a transform. The picture is upright, so the PSF is turned: what conv2d does."""
-        if self.weights is None:
-            bands = planes if self.spectra is None else torch.einsum("bkhw,kl->blhw", planes, self.spectra)
-            extended = extend(bands, self.window, self.border)
-            return torch.nn.functional.conv2d(extended, psfs[:, None], groups=psfs.shape[0])
-        if self.spectra is None:
-            kernels = self.weights[:, :, None, None] * psfs
+    def _by_kernels(self, mixing: Tensor, psfs: Tensor) -> Callable[[Tensor], Tensor]:
+        """sum_k (sum_g M_ckg h_g) C_k: for few channels and planes the PSFs are contracted, not the spectra."""
+
+        def kernels() -> Tensor:
+            return torch.einsum("ckg,gyx->ckyx", mixing, psfs)
+
+        if self.direct:
+            found = kernels()
+            # the picture is upright, so the PSF is turned: a correlation, which is what conv2d computes
+            return lambda planes: torch.nn.functional.conv2d(extend(planes, self.window, self.border), found)
+        convolution, count = self.convolution, mixing.shape[0] * mixing.shape[1]
+        channels = self._transfers(count, lambda: convolution.transfer(kernels()), psfs, mixing)
+
+        def blur(planes: Tensor) -> Tensor:
+            spectrum = convolution.transform(planes)
+            return torch.stack([convolution.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
+
+        return blur
+
+    def _by_groups(self, weights: Tensor, psfs: Tensor) -> Callable[[Tensor], Tensor]:
+        """sum_g h_g (sum_(l in g) kappa_cl I_l): for few PSFs the bands are contracted before the transform."""
+        channels, count = weights.shape[0], psfs.shape[0]
+        if self.owner is None:
+            owner = torch.arange(count, device=weights.device)
         else:
-            kernels = torch.einsum("cl,kl,lyx->ckyx", self.weights, self.spectra, psfs)
-        return torch.nn.functional.conv2d(extend(planes, self.window, self.border), kernels)
+            owner = self.owner.to(weights.device)
+        mixing = weights[:, None] * (owner == torch.arange(count, device=weights.device)[:, None])  # (C, G, L)
+        convolution = self.convolution
+        transfers = None
+        if not self.direct:
+            transfers = self._transfers(count, lambda: convolution.transfer(psfs), psfs)
+
+        def blur(planes: Tensor) -> Tensor:
+            groups = torch.einsum("cgl,blhw->bcghw", mixing, planes)
+            if transfers is not None:
+                return convolution.back((convolution.transform(groups) * transfers).sum(2))
+            extended = extend(groups, self.window, self.border).flatten(0, 1)
+            return torch.nn.functional.conv2d(extended, psfs[None]).unflatten(0, (-1, channels))[:, :, 0]
+
+        return blur
 
     def _per_band(self, planes: Tensor, psfs: Tensor) -> Tensor:
         """Each band by itself, for a sensor that sees all bands."""
+        if self.direct:
+            light = planes if self.spectra is None else torch.einsum("bkhw,kl->blhw", planes, self.spectra)
+            extended = extend(light, self.window, self.border)
+            return torch.nn.functional.conv2d(extended, psfs[:, None], groups=psfs.shape[0])
 
         def band(planes: Tensor, psf: Tensor, index: int) -> Tensor:
             plane = (
@@ -160,6 +199,55 @@ class Renderer:
         if self.cache is None or not self._keeps(count, *sources):
             return build()
         return self.cache.get((*sources, self.convolution.size), build)
+
+
+def rendering_work(
+    picture: tuple[int, int],
+    window: tuple[int, int],
+    *,
+    planes: int,
+    factored: bool,
+    bands: int,
+    groups: int,
+    channels: int | None,
+    border: str,
+    direct: bool,
+    tile: int | None,
+    itemsize: int,
+    max_memory: float,
+    coverage: bool,
+) -> Work:
+    """What `Renderer` does for one layer of one picture. Arguments: as its own; channels: None for all bands."""
+    part = picture if tile is None else (min(tile, picture[0]), min(tile, picture[1]))
+    tiles = math.ceil(picture[0] / part[0]) * math.ceil(picture[1] / part[1])
+    sizes = Convolution.of(part, window, border=border, itemsize=itemsize, max_memory=max_memory)
+    points, kernel, pixels = sizes.size[0] * sizes.size[1], window[0] * window[1], picture[0] * picture[1]
+    out = bands if channels is None else channels
+    mixed = float(out * groups * kernel if coverage and channels is not None else 0)
+    held: float
+    if channels is None:
+        inputs, kernels, products, held = bands, bands, bands, 4 + bands * pixels / points
+    elif factored and (direct or groups < bands or channels * planes <= bands):
+        inputs, kernels, products = planes, channels * planes, channels * planes
+        mixed, held = mixed + kernels * groups * kernel, inputs + kernels + 3 + channels
+    elif not factored and (direct or channels * groups < bands):
+        inputs, kernels, products = channels * groups, groups, channels * groups
+        mixed, held = mixed + inputs * bands * pixels / 8, 2 * inputs + groups
+    else:
+        inputs, kernels = (planes if factored else bands), bands
+        products, held = bands * (1 + channels + (planes if factored else 0)), inputs + 2 * sizes.bands + 2 * channels
+    if direct:
+        summed = products + (out if coverage else 0)
+        touched = (inputs + 2 * out) * pixels + mixed
+        memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
+        return Work({"product": float(summed * pixels * kernel), "touch": touched}, memory)
+    transforms = tiles * (inputs + out) + kernels
+    touched = float(tiles * points * (inputs + out + products) + kernels * points) + mixed
+    if coverage:
+        transforms += tiles * (1 + out) + out
+        touched += tiles * points * (1 + 3 * out) + 6 * out * pixels
+    memory = float(itemsize * (held * points + (inputs + out) * pixels))
+    return Work({"transform": transforms * points * math.log2(max(2, points)), "touch": touched}, memory)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcam.optics.estimates import trace
 from kcam.optics.propagation import PROPAGATORS, Propagator, choose
-from kcam.optics.psf import Query, ray_displacement, samples_by_rule
+from kcam.optics.psf import Query, samples_by_rule
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def explain(query: Query, *, propagator: str | Propagator = "nonparaxial", metho
         energy = chosen(few).sum((-2, -1)).cpu()
     samples = None
     if chosen.on_grid:
-        displacement = ray_displacement(query).tolist()
+        displacement = query.displacement.tolist()
         counts = [
             query.samples or samples_by_rule(query, displacement=spread, wavelength=wavelength)
             for spread, wavelength in zip(displacement, query.wavelengths.tolist(), strict=True)

@@ -17,10 +17,11 @@ from torch import Tensor
 
 from kcam.cache import ValueCache, fingerprint
 from kcam.context import Context, Stage
-from kcam.optics.convolution import BORDERS, Renderer
+from kcam.effects import Work
+from kcam.optics.convolution import BORDERS, Renderer, rendering_work
 from kcam.optics.lens import Lens
 from kcam.optics.propagation import PHYSICS, Propagator, choose
-from kcam.optics.psf import Query, ray_displacement
+from kcam.optics.psf import Query, samples_by_rule
 from kcam.optics.sampling import KAPPA
 from kcam.precision import full_precision
 from kcam.scene import Scene
@@ -173,7 +174,7 @@ class Imaging(Stage):
         if self.psf_shape is not None:
             return self.psf_shape
         query = self._query(wavelengths, vergences, (1, 1), torch.empty(0, dtype=torch.float64))
-        blur = float((ray_displacement(query) + self.lens.pixel_phase_displacement(query)).max())
+        blur = float((query.displacement + self.lens.pixel_phase_displacement(query)).max())
         tail = float(wavelengths.max()) * float(query.sensor_distance.detach()) / (2 * math.pi**2 * OUTSIDE_SHARE)
         half = math.ceil((blur + tail * self.lens.aperture.rim_per_area()) / self.pixel_pitch)
         height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
@@ -238,23 +239,37 @@ class Imaging(Stage):
         """PSFs of the bands of a scene, (Z, L, h, w) in the dtype and on the device of `like`; kept while nothing
         changes.
         """
+        psfs = self._grouped_bank(wavelengths, vergences=vergences, shape=shape, like=like)
+        owner = self._groups(wavelengths)
+        return psfs if owner is None else psfs[:, owner.to(psfs.device)]
+
+    def _groups(self, wavelengths: Tensor) -> Tensor | None:
+        """Which PSF each band takes, (L,), where several take one; None where each has its own."""
+        count = len(wavelengths)
+        if self.blur and (self.bands is None or self.bands >= count):
+            return None
+        owner = torch.empty(count, dtype=torch.long)
+        for index, group in enumerate(wavelengths.argsort().tensor_split((self.bands or count) if self.blur else 1)):
+            owner[group] = index
+        return owner
+
+    def _psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
+        """At which the PSFs are computed: the bands', or the means of their groups'."""
+        owner = self._groups(wavelengths)
+        if owner is None:
+            return wavelengths
+        sums = wavelengths.new_zeros(int(owner.max()) + 1).index_add_(0, owner, wavelengths)
+        return sums / owner.bincount()
+
+    def _grouped_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
+        """PSFs of the groups of bands that share one, (Z, G, h, w)."""
         if not self.blur:
-            return like.new_ones(len(vergences), len(wavelengths), 1, 1)
-        groups = list(wavelengths.argsort().tensor_split(min(self.bands or len(wavelengths), len(wavelengths))))
-        query = self._query(wavelengths, vergences, shape, like)
-        if len(groups) < len(wavelengths):
-            query = replace(query, wavelengths=torch.stack([wavelengths[group].mean() for group in groups]))
+            return like.new_ones(len(vergences), 1, 1, 1)
+        query = self._query(self._psf_wavelengths(wavelengths), vergences, shape, like)
 
         def build() -> Tensor:
             psfs = choose(query, propagator=self.propagator, method=self.method)(query)
-            if self.renormalise:
-                psfs = psfs / psfs.sum((-2, -1), keepdim=True)
-            if len(groups) == len(wavelengths):
-                return psfs
-            owner = torch.empty(len(wavelengths), dtype=torch.long)
-            for index, group in enumerate(groups):
-                owner[group] = index
-            return psfs[:, owner.to(psfs.device)]
+            return psfs / psfs.sum((-2, -1), keepdim=True) if self.renormalise else psfs
 
         if torch.is_grad_enabled() and any(p.requires_grad for p in self.lens.parameters()):
             return build()
@@ -274,6 +289,68 @@ class Imaging(Stage):
         layers = torch.arange(vergences.numel(), device=depth.device, dtype=torch.float64)
         return torch.clamp(1 - (position - layers[:, None, None]).abs(), min=0)
 
+    def _layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Vergences of the layers in which there is anything, and the share of each pixel in them; None for one."""
+        depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
+        vergences = self.depth_layers(depth, scene.wavelengths)
+        if vergences.numel() == 1:
+            return vergences, None
+        shares = self._layer_shares(depth, vergences).to(planes)
+        present = (shares.flatten(2).amax(dim=(0, 2)) > 0).cpu()
+        return vergences[present], shares[:, present.to(shares.device)]
+
+    def _layers_at_once(self, bands: int, window: tuple[int, int], planes: Tensor) -> int:
+        """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
+        return max(1, int(self.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
+
+    def work(self, scene: Scene, *, channels: int | None = None) -> Work:
+        """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
+        planes = scene.coefficients
+        if self.precision is not None:
+            planes = planes.to(getattr(torch, self.precision))
+        batch, count, height, width = planes.shape
+        bands, factored = scene.wavelengths.numel(), scene.spectra is not None
+        low_rank = self.rank is not None and self.rank < count
+        first = Work()
+        if low_rank and self.rank is not None:
+            touched = float(batch * height * width * count * (count / 8 + self.rank))
+            first, count, factored = Work({"touch": touched}, planes.element_size() * touched / count), self.rank, True
+        vergences, _ = self._layers_of(scene, planes)
+        window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
+        layers, itemsize = vergences.numel(), planes.element_size()
+        rendering = rendering_work(
+            (height, width),
+            window,
+            planes=count,
+            factored=factored,
+            bands=bands,
+            groups=len(self._psf_wavelengths(scene.wavelengths)),
+            channels=channels,
+            border=self.border,
+            direct=self.direct,
+            tile=self.tile,
+            itemsize=itemsize,
+            max_memory=self.max_memory,
+            coverage=layers > 1 and self.occlusion,
+        )
+        operations = {kind: number * layers * batch for kind, number in rendering.operations.items()}
+        operations["layer"] = float(layers)
+        bank = 0.0
+        groups = 1
+        if self.blur:
+            grouped = self._psf_wavelengths(scene.wavelengths)
+            groups = len(grouped)
+            query = self._query(grouped, vergences, window, planes)
+            row = choose(query, propagator=self.propagator, method=self.method)
+            at_once = min(layers, self._layers_at_once(bands, window, planes))
+            operations |= {row.method: row.cost(query), "bank": float(math.ceil(layers / at_once))}
+            operations["psf"] = float(layers * groups)
+            if self.lens.has_pixel_phase:
+                operations["map"] = _map_work(query)
+            bank = float(2 * at_once * groups * window[0] * window[1] * itemsize)
+        shares = float(layers * height * width * batch * 16) if layers > 1 else 0.0
+        return first + Work(operations, rendering.memory * batch + bank + shares)
+
     # ---- rendering -------------------------------------------------------------------------------------------------
 
     def _render(self, scene: Scene, planes: Tensor, contraction: Tensor | None) -> Tensor:
@@ -284,22 +361,16 @@ class Imaging(Stage):
             return planes.new_zeros(batch, channels, height, width) + planes.sum()
         spectra = None if scene.spectra is None else scene.spectra.to(planes)
         weights = None if contraction is None else contraction.to(planes)
-        depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
-        vergences = self.depth_layers(depth, scene.wavelengths)
-        shares = None if vergences.numel() == 1 else self._layer_shares(depth, vergences).to(planes)
-        if shares is not None:
-            present = (shares.flatten(2).amax(dim=(0, 2)) > 0).cpu()
-            vergences, shares = vergences[present], shares[:, present.to(shares.device)]
+        vergences, shares = self._layers_of(scene, planes)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
-        # a bank of PSFs for as many layers as fit into a quarter of the memory
-        per_layer = bands * window[0] * window[1] * planes.element_size()
-        length = max(1, int(self.max_memory / 4 // per_layer))
+        length = self._layers_at_once(bands, window, planes)
         layers = _Layers(planes, shares, occlusion=self.occlusion)
         for start in range(0, vergences.numel(), length):
             some = vergences[start : start + length]
-            psfs = self.psf_bank(scene.wavelengths, vergences=some, shape=window, like=planes)
+            psfs = self._grouped_bank(scene.wavelengths, vergences=some, shape=window, like=planes)
             renderer = Renderer(
                 psfs,
+                owner=self._groups(scene.wavelengths),
                 spectra=spectra,
                 weights=weights,
                 picture=(height, width),
@@ -311,6 +382,15 @@ class Imaging(Stage):
             )
             layers.add(renderer, first=start)
         return layers.light
+
+
+def _map_work(query: Query) -> float:
+    """Pixels of the maps, and three times the samples that their field is warped onto (a fit), for each wavelength."""
+    maps = [element.pixel_map(query.wavelengths) for element in query.lens.elements]
+    pixels = sum(found.values.numel() for found in maps if found is not None)
+    pairs = zip(query.displacement.tolist(), query.wavelengths.tolist(), strict=True)
+    counts = [samples_by_rule(query, displacement=spread, wavelength=wavelength) for spread, wavelength in pairs]
+    return float(sum(pixels + (0 if query.paraxial else 3 * count**2) for count in counts))
 
 
 class _Layers:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from kcam.optics.psf import Query, ray_displacement, residual_path, to_pixels
+from kcam.optics.psf import Query, residual_path, to_pixels
 from kcam.optics.pupil import Pupil, from_image_side
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
@@ -34,7 +34,7 @@ def radial_psf(query: Query) -> Tensor:
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
     largest = float(scales.detach().max())
-    displacement = float(ray_displacement(query).max())
+    displacement = float(query.displacement.max())
     corner = math.sqrt(2) * query.half_window
     count = math.ceil(largest * (corner + displacement) / 2) + 32
     rho, weights = ring_nodes(query, count)
@@ -163,7 +163,7 @@ def polar_psf(query: Query, *, density: float = 1.0) -> Tensor:
     """
     wavelengths = query.wavelengths.to(query.device)
     a, d = query.image_side_semi_aperture, query.sensor_distance
-    displacement = ray_displacement(query)
+    displacement = query.displacement
     bands = []
     for index, wavelength in enumerate(query.wavelengths.tolist()):
         scale = 2 * math.pi / wavelengths[index] * a / d

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kcam.optics.angular_spectrum import angular_spectrum_psf, spectrum_grids
 from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, map_phase, trace
 from kcam.optics.polar import radial_psf
-from kcam.optics.psf import Query, fft_grid, grid_psf, ray_displacement, samples_by_rule
+from kcam.optics.psf import Query, fft_grid, grid_psf, samples_by_rule
 from kcam.optics.pupil import EDGE_MARGIN
 from kcam.optics.rays import geometric_psf
 from kcam.optics.reference import PIXELS_LIMIT, SMOOTH_LIMIT, reference_psf
@@ -59,7 +59,7 @@ class Propagator(nn.Module):
 
         Raises: ValueError where the row is not valid for this query.
         """
-        query = replace(query, paraxial=self.paraxial)
+        query = _as(query, paraxial=self.paraxial)
         reason = self.valid_for(query)
         if reason is not None:
             raise ValueError(f"{self.physics}/{self.method} {reason}")
@@ -76,7 +76,7 @@ class Propagator(nn.Module):
 
         Never more than 3 times too small (above 1e-6), 4 times too large in the median of random cameras.
         """
-        return self.error_of(replace(query, paraxial=self.paraxial))
+        return self.error_of(_as(query, paraxial=self.paraxial))
 
     def model_error(self, query: Query) -> float:
         """Estimated L1 error that the reference itself has against Rayleigh-Sommerfeld, on the axis."""
@@ -84,7 +84,12 @@ class Propagator(nn.Module):
 
     def cost(self, query: Query) -> float:
         """Estimated floating-point operations, weighted by how fast the row's kind of work runs."""
-        return self.cost_of(replace(query, paraxial=self.paraxial))
+        return self.cost_of(_as(query, paraxial=self.paraxial))
+
+
+def _as(query: Query, *, paraxial: bool) -> Query:
+    """The query for a model; the same one where it is for it already, with what it has kept."""
+    return query if query.paraxial == paraxial else replace(query, paraxial=paraxial)
 
 
 def wave_front_error(query: Query) -> float:
@@ -117,7 +122,7 @@ def _paraxial_error(rays: Rays, query: Query) -> float:
 
 def _grid_estimate(method: str) -> Callable[[Query], float]:
     def estimate(query: Query) -> float:
-        displacement = ray_displacement(query)
+        displacement = query.displacement
         d, semi = (float(v.detach()) for v in (query.sensor_distance, query.image_side_semi_aperture))
         worst = 0.0
         for rays in trace(query):
@@ -155,7 +160,7 @@ def _spectrum_estimate(query: Query) -> float:
 
 def _grid_sizes(query: Query) -> list[tuple[int, int]]:
     """(pupil samples, points) of each wavelength, also where so many would be refused: a cost is no refusal."""
-    displacement = ray_displacement(query).tolist()
+    displacement = query.displacement.tolist()
     return [
         (
             query.samples or samples_by_rule(query, displacement=displacement[index], wavelength=wavelength),
@@ -330,6 +335,7 @@ def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method
     if propagator not in PHYSICS:
         raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
     rows = [row for (physics, _), row in PROPAGATORS.items() if physics == propagator]
+    query = _as(query, paraxial=rows[0].paraxial)
     if method is not None:
         for row in rows:
             if row.method == method:

@@ -9,6 +9,7 @@ of that light which falls into its window, and is not normalised to 1.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -119,13 +120,28 @@ class Query:
         """
         per_pixel = 1.0
         if self.integrate:
+            semi_aperture, distance = self.scale
             per_pixel = sampling.points_per_pixel(
                 pixel_pitch=self.pixel_pitch,
-                semi_aperture=float(self.image_side_semi_aperture.detach()),
-                sensor_distance=float(self.sensor_distance.detach()),
+                semi_aperture=semi_aperture,
+                sensor_distance=distance,
                 wavelength=wavelength,
             )
         return per_pixel, math.ceil(per_pixel * self.half_pixels)
+
+    @functools.cached_property
+    def scale(self) -> tuple[float, float]:
+        """(a', d) as numbers [m], without a gradient; kept, because sampling rules ask for it at each wavelength."""
+        with torch.no_grad():  # a checkpoint that computes again must find the same graph
+            return float(self.image_side_semi_aperture), float(self.sensor_distance)
+
+    @functools.cached_property
+    def displacement(self) -> Tensor:
+        """How far the smooth part of the pupil sends its rays on the sensor, max d |grad W|, (L,) float64 [m].
+
+        Without a gradient; kept, because every row of the table that is priced asks for it.
+        """
+        return _ray_displacement(self)
 
     def aperture_pixels(self) -> Tensor:
         """The transmission of an aperture that is a map of pixels, (n, n)."""
@@ -174,8 +190,7 @@ def residual_path(query: Query, pupil: Pupil) -> tuple[Tensor, Tensor]:
     return torch.stack(coefficients, dim=-1), torch.stack([m.expand(shape) for m in maps])
 
 
-def ray_displacement(query: Query) -> Tensor:
-    """How far the smooth part of the pupil sends its rays on the sensor, max d |grad W|, (L,) float64 [m]."""
+def _ray_displacement(query: Query) -> Tensor:
     with torch.no_grad():
         extremes = query.vergences.detach()
         if extremes.numel() > 2:
@@ -202,7 +217,7 @@ def ray_displacement(query: Query) -> Tensor:
 
 def grid_psf(query: Query, *, method: str) -> Tensor:
     """PSFs by a transform of a Cartesian pupil grid: `matrix`, `chirp_z` or `fft`; (Z, L, H, W)."""
-    displacement = ray_displacement(query)
+    displacement = query.displacement
     bands: list[Tensor] = [torch.empty(0)] * query.wavelengths.numel()
     for members, count, per_pixel in _groups(query, displacement, method=method):
         images = _grid_group(query, members, count=count, per_pixel=per_pixel, method=method, displacement=displacement)
@@ -223,8 +238,8 @@ def samples_by_rule(query: Query, *, displacement: float, wavelength: float) -> 
 
 def _geometry(query: Query, *, displacement: float, wavelength: float) -> dict[str, float]:
     return {
-        "semi_aperture": float(query.image_side_semi_aperture.detach()),
-        "sensor_distance": float(query.sensor_distance.detach()),
+        "semi_aperture": query.scale[0],
+        "sensor_distance": query.scale[1],
         "wavelength": wavelength,
         "half_window": query.half_window,
         "displacement": displacement,

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcam.optics.psf import Query, ray_displacement, residual_path
+from kcam.optics.psf import Query, residual_path
 from kcam.optics.pupil import pixel_under, round_weights, unfold_quadrant
 
 
@@ -16,7 +16,7 @@ def geometric_psf(query: Query) -> Tensor:
 
     Source: the geometrical limit of equation (3.4) by stationary phase.
     """
-    displacement = float(ray_displacement(query).max())
+    displacement = float(query.displacement.max())
     count = min(1024, max(256, 32 * math.ceil(4 * displacement / query.pixel_pitch / 32)))
     half = count // 2
     spacing = 2.0 / count

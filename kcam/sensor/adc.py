@@ -14,7 +14,14 @@ from kcam.units import check_positive
 
 
 @in_float32
-def quantise(signal: Tensor, *, bits: int, black_level: Tensor | float = 0.0, gain: Tensor | float = 1.0) -> Tensor:
+def quantise(
+    signal: Tensor,
+    *,
+    bits: int,
+    black_level: Tensor | float = 0.0,
+    gain: Tensor | float = 1.0,
+    rounding: bool = True,
+) -> Tensor:
     """Convert a voltage to one of 2^bits numbers.
 
     y = round_ste( (2^bits - 1) clip_ste(gain signal + black_level / (2^bits - 1), 0, 1) ) / (2^bits - 1)
@@ -24,12 +31,13 @@ def quantise(signal: Tensor, *, bits: int, black_level: Tensor | float = 0.0, ga
 
     Args:      signal: any shape, 1.0 = full well.  bits: 1..24, the steps that float32 can hold.
                black_level: the number that no light gives [DN].  gain: analogue gain, 1 at base ISO.
+           rounding: False leaves the steps out.
     Returns:   same shape, 1.0 = full scale (2^bits - 1 DN).
     Valid when the dtype holds the steps: float16 has 11 bits, bfloat16 8, and is given back with those.
     """
     top = 2**bits - 1
     level = clip_ste(signal * like(gain, signal) + like(black_level, signal) / top, 0.0, 1.0)
-    return round_ste(level * top) / top
+    return round_ste(level * top) / top if rounding else level
 
 
 class ADC(Stage):
@@ -39,14 +47,23 @@ class ADC(Stage):
 
     Args:      bits: 1..24.  black_level: the number that no light gives, 0 <= black_level < 2^bits - 1 [DN].
                gain: analogue gain, > 0; None to take it from the context (ISO / 100).
+           rounding: False leaves the steps out, as a `Plan` may.
     Raises:    TypeError for bits that are no integer; ValueError for a value out of range.
     """
 
     bits: int
     black_level: Tensor | float
     gain: Tensor | float | None
+    rounding: bool
 
-    def __init__(self, bits: int = 12, *, black_level: Tensor | float = 0.0, gain: Tensor | float | None = None):
+    def __init__(
+        self,
+        bits: int = 12,
+        *,
+        black_level: Tensor | float = 0.0,
+        gain: Tensor | float | None = None,
+        rounding: bool = True,
+    ):
         super().__init__()
         if isinstance(bits, bool) or not isinstance(bits, int):
             raise TypeError(f"bits must be an integer such as 12, got {bits!r}.")
@@ -61,12 +78,34 @@ class ADC(Stage):
             )
         if gain is not None:
             check_positive(gain, name="gain", unit="(1 at base ISO)")
-        hold(self, bits=bits, black_level=black_level, gain=gain)
+        hold(self, bits=bits, black_level=black_level, gain=gain, rounding=rounding)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) to the same shape: see `quantise`."""
-        gain = (context or Context()).gain if self.gain is None else self.gain
-        return quantise(signal, bits=self.bits, black_level=self.black_level, gain=gain)
+        return quantise(
+            signal, bits=self.bits, black_level=self.black_level, gain=self._gain(context), rounding=self.rounding
+        )
+
+    def _gain(self, context: Context | None) -> Tensor | float:
+        return (context or Context()).gain if self.gain is None else self.gain
+
+    def error_if_skipped(self, signal: Tensor, context: Context | None = None) -> float:
+        """One step / sqrt(12), relative to the RMS of the signal; see `kcam.effects.Skippable`."""
+        step = 1 / ((2**self.bits - 1) * float(torch.as_tensor(self._gain(context)).detach().max()))
+        rms = float(signal.detach().double().square().mean().sqrt()) if signal.numel() else 1.0
+        return step / 12**0.5 / max(rms, 1e-12)
+
+    def cost(self, signal: Tensor, context: Context | None = None) -> float:
+        """Passes over the signal."""
+        return 4.0
+
+    def reason(self, signal: Tensor, context: Context | None = None) -> str:
+        """The steps."""
+        return f"{2**self.bits - 1} steps, {self.error_if_skipped(signal, context):.1e} of the signal's RMS"
+
+    def bypass(self) -> ADC:
+        """What stands in for it when it is left out: its gain, black level and limits, without the steps."""
+        return ADC(self.bits, black_level=self.black_level, gain=self.gain, rounding=False)
 
     def provides(self) -> dict[str, Any]:
         """The black level as a share of full scale, and the gain where it was given."""

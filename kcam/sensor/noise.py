@@ -214,6 +214,10 @@ def fixed_pattern(
     return signal * (1 + like(prnu, signal) * gain) + offset * (like(dsnu, signal) / like(full_well, signal))
 
 
+def _rms(signal: Tensor) -> float:
+    return max(float(signal.detach().double().square().mean().sqrt()), 1e-12) if signal.numel() else 1.0
+
+
 class Mean(Stage):
     """A random stage at its mean: it holds that stage, so parameters are shared, and calls its `expected`."""
 
@@ -242,6 +246,29 @@ class RandomStage(Stage):
     def mean(self) -> Mean:
         """The same stage at its mean, sharing parameters."""
         return Mean(self)
+
+    def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor | float:
+        """Standard deviation of the noise [share of the full well]: a number, or for each element of the signal."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how large its noise is.")
+
+    def error_if_skipped(self, signal: Tensor, context: Context | None = None) -> float:
+        """RMS of `sigma` relative to the RMS of the signal; see `kcam.effects.Skippable`."""
+        sigma = torch.as_tensor(self.sigma(signal, context)).detach().double()
+        return float(sigma.square().mean().sqrt() / _rms(signal))
+
+    def cost(self, signal: Tensor, context: Context | None = None) -> float:
+        """Passes over the signal: a random number takes some ten of them."""
+        return 10.0
+
+    def reason(self, signal: Tensor, context: Context | None = None) -> str:
+        """How many electrons it is, beside the signal's."""
+        full_well = float(torch.as_tensor(self._resolve(context, None)[0]).detach().max())
+        sigma, level = self.error_if_skipped(signal, context), _rms(signal) * full_well
+        return f"sigma {sigma * level:.3g} of {level:.3g} electrons"
+
+    def bypass(self) -> Mean:
+        """What stands in for it when it is left out: its mean."""
+        return self.mean()
 
     def provides(self) -> dict[str, Any]:
         """The full well, where it was given."""
@@ -282,6 +309,15 @@ class ShotNoise(RandomStage):
         """
         return saturate(signal)
 
+    def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """sqrt(N) electrons, none above the full well."""
+        full_well, _ = self._resolve(context, None)
+        return (signal.clamp(0, 1) / like(full_well, signal)).sqrt()
+
+    def cost(self, signal: Tensor, context: Context | None = None) -> float:
+        """Poisson draws take longer than others."""
+        return 40.0
+
 
 class ReadNoise(RandomStage):
     """The noise of the read-out, EMVA's temporal dark noise sigma_d: `read_noise`. Its mean is the signal.
@@ -306,6 +342,11 @@ class ReadNoise(RandomStage):
         """(B,C,H,W) to the same shape: see `read_noise`."""
         full_well, generator = self._resolve(context, generator)
         return read_noise(signal, sigma_electrons=self.sigma_electrons, full_well=full_well, generator=generator)
+
+    def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor | float:
+        """sigma_d."""
+        full_well, _ = self._resolve(context, None)
+        return like(self.sigma_electrons, signal) / like(full_well, signal)
 
 
 class DarkCurrent(RandomStage):
@@ -371,6 +412,15 @@ class DarkCurrent(RandomStage):
         full_well, _ = self._resolve(context, None)
         return _add_mean(signal, electrons=self.electrons(), full_well=full_well)
 
+    def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """The square root of the dark electrons."""
+        full_well, _ = self._resolve(context, None)
+        return torch.as_tensor(self.electrons()).sqrt() / torch.as_tensor(full_well)
+
+    def cost(self, signal: Tensor, context: Context | None = None) -> float:
+        """Poisson draws take longer than others."""
+        return 40.0
+
 
 @in_float32
 def _add_mean(signal: Tensor, *, electrons: Tensor | float, full_well: Tensor | float) -> Tensor:
@@ -414,3 +464,9 @@ class FixedPattern(RandomStage):
         """(B,C,H,W) to the same shape: see `fixed_pattern`. It draws nothing, so it takes no generator."""
         full_well, _ = self._resolve(context, None)
         return fixed_pattern(signal, prnu=self.prnu, dsnu=self.dsnu, full_well=full_well, seed=self.seed)
+
+    def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """Spread of gain and offset, over many sensors."""
+        full_well, _ = self._resolve(context, None)
+        offset = torch.as_tensor(self.dsnu).to(signal) / like(full_well, signal)
+        return torch.hypot(like(self.prnu, signal) * signal, offset.expand_as(signal))

@@ -13,7 +13,7 @@ import torch
 from kcam import optics
 from kcam.optics import PROPAGATORS
 from kcam.optics.angular_spectrum import spectrum_grids
-from kcam.optics.psf import Query, ray_displacement, samples_by_rule
+from kcam.optics.psf import Query, samples_by_rule
 from kcam.optics.reference import convergence
 from kcam.units import mm, nm, um
 
@@ -70,7 +70,7 @@ def random_query(seed: int) -> Query:
             integrate=rng.random() < 0.7,
         )  # fmt: skip
         # the reference is to take a second, not a minute
-        if samples_by_rule(asked, displacement=float(ray_displacement(asked)[0]), wavelength=wavelength) <= 400:
+        if samples_by_rule(asked, displacement=float(asked.displacement[0]), wavelength=wavelength) <= 400:
             return asked
 
 

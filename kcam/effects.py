@@ -1,0 +1,45 @@
+"""What the planner asks of a stage: what it would cost to leave its effect out, and what its work is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from torch import Tensor
+
+from kcam.context import Context
+
+
+@dataclass(frozen=True)
+class Work:
+    """Counts of operations by their kind (see `kcam.costs.RATES`), and memory at the peak [bytes].
+
+    Two works one after the other add up their operations and need the larger memory.
+    """
+
+    operations: Mapping[str, float] = field(default_factory=dict)
+    memory: float = 0.0
+
+    def __add__(self, other: Work) -> Work:
+        kinds = {**self.operations, **other.operations}
+        total = {kind: self.operations.get(kind, 0.0) + other.operations.get(kind, 0.0) for kind in kinds}
+        return Work(total, max(self.memory, other.memory))
+
+
+@runtime_checkable
+class Skippable(Protocol):
+    """A stage that a `Plan` may leave out: three methods. A stage without them is always kept.
+
+    Left out means that the signal passes unchanged, or through the stage that its method ``bypass()`` gives. A stage
+    with a parameter that requires grad is kept whatever it says.
+    """
+
+    def error_if_skipped(self, signal: Tensor, context: Context) -> float:
+        """RMS change of the signal (B,C,H,W), relative to its RMS: what the picture loses without this stage."""
+
+    def cost(self, signal: Tensor, context: Context) -> float:
+        """How often the stage touches an element of the signal: about 1 for a sum, 10 for an exponential."""
+
+    def reason(self, signal: Tensor, context: Context) -> str:
+        """What decides, with its number: "sigma 3 electrons of 10 000"."""

@@ -1,0 +1,18 @@
+"""The planner: simulate only the effects that a scene calls for, inside a tolerance, and say what was left out."""
+
+from kcam.planner.making import Planner, explain, make_plan, measured
+from kcam.planner.plan import Decision, OutOfRange, Plan, PlannedCamera, Range, noiseless_raw, relative_rms
+
+__all__ = [
+    "Decision",
+    "OutOfRange",
+    "Plan",
+    "PlannedCamera",
+    "Planner",
+    "Range",
+    "explain",
+    "make_plan",
+    "measured",
+    "noiseless_raw",
+    "relative_rms",
+]

@@ -1,0 +1,225 @@
+"""The choices that a plan makes about the optics: ladders from the cheapest setting to the reference physics.
+
+To add a choice, write a function that gives its ladder, and a row of `LADDERS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from kcam.optics import Imaging
+from kcam.optics.propagation import choose
+from kcam.optics.sampling import KAPPA
+from kcam.planner.trials import Trials
+from kcam.scene import Scene
+
+FEW_BANDS, FEW_LAYERS = 3, 3
+"""Of the settings beside which a choice is priced."""
+
+ORDER = 1.5
+"""A ladder's error falls at least with this power of its step: two where it is fine enough, one where phases jump."""
+
+BANDS = (1, 2, 4, 7, 12, 19)
+LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
+WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
+KAPPAS = (1.3, 1.7, 2.1)
+RANKS = (1, 2, 3, 4, 6, 9, 14)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A rung: what it is called, what it changes in the Imaging, and how fine it is (where rungs converge)."""
+
+    label: str
+    changes: dict[str, Any]
+    fineness: float = 1.0
+
+
+@dataclass
+class Ladder:
+    """A choice: its rungs from the cheapest to the reference, the settings beside which it is priced, and where it is.
+
+    successive: an error is that against the next rung, and what is left beyond it by the order of convergence: for
+    ladders whose top costs as much as the reference picture. Else it is that against the top.
+    blurs: whether it only matters where there is blur.
+    alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
+    follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers.
+    """
+
+    effect: str
+    levels: list[Level]
+    beside: dict[str, Any]
+    successive: bool = False
+    blurs: bool = True
+    alternatives: Callable[[Level], list[Level]] | None = None
+    follows: Ladder | None = None
+    position: int = 0
+    errors: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    @property
+    def level(self) -> Level:
+        """The rung that it stands on."""
+        return self.levels[self.position]
+
+    @property
+    def error(self) -> float:
+        """Estimated, of the rung that it stands on."""
+        return 0.0 if self.position == len(self.levels) - 1 else self.errors[self._key(self.position)]
+
+    def _key(self, position: int) -> tuple[int, int]:
+        return position, self.follows.position if self.follows else 0
+
+    def price(self, trials: Trials) -> None:
+        """Estimate the error of the rung that it stands on."""
+        key = self._key(self.position)
+        if self.position == len(self.levels) - 1 or key in self.errors:
+            return
+        beside = self.beside | (self.follows.level.changes if self.follows else {})
+        upper = self.levels[self.position + 1] if self.successive else self.levels[-1]
+        candidates = [self.level] + (self.alternatives(self.level) if self.alternatives else [])
+        errors = [trials.error(beside | level.changes, beside | upper.changes) for level in candidates]
+        best = min(range(len(errors)), key=errors.__getitem__)
+        self.levels[self.position] = candidates[best]
+        error = errors[best]
+        if self.successive and self.position + 2 < len(self.levels):
+            error /= 1 - (self.level.fineness / upper.fineness) ** ORDER
+        self.errors[key] = error
+
+    def climb(self, trials: Trials) -> None:
+        """One rung up, and its error."""
+        self.position += 1
+        self.price(trials)
+
+    def why(self) -> str:
+        """The number that decided."""
+        if self.position == 0:
+            return "" if len(self.levels) == 1 else "the least there is suffices"
+        below = max((key for key in self.errors if key[0] == self.position - 1), key=lambda key: key[1])
+        return f"{self.levels[self.position - 1].label} would cost {self.errors[below]:.2g}"
+
+
+def ladders(trials: Trials, scene: Scene) -> list[Ladder]:
+    """The choices that exist for a camera and a scene (the one that takes longest)."""
+    imaging = trials.imaging
+    if imaging is None:
+        return []
+    view = _View(trials, imaging, scene)
+    return [ladder for make in LADDERS for ladder in make(view)]
+
+
+class _View:
+    """What the ladders look at."""
+
+    def __init__(self, trials: Trials, imaging: Imaging, scene: Scene) -> None:
+        self.imaging, self.scene = imaging, scene
+        planes = scene.coefficients
+        self.vergences, _ = imaging._layers_of(scene, planes)
+        depth = torch.as_tensor(scene.depth, dtype=torch.float64)
+        self.layers = len(imaging.depth_layers(depth, scene.wavelengths)) if depth.numel() else 1
+        self.bands = min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
+        self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
+        query = imaging._query(scene.wavelengths, self.vergences[:1], self.window, planes)
+        self.row = choose(query, propagator=imaging.propagator, method=imaging.method)
+        self.trained = any(p.requires_grad for p in imaging.lens.parameters())
+        self.beside = self.few()
+
+    def few(self, *, bands: bool = True, layers: bool = True) -> dict[str, Any]:
+        """Cheap settings of the others."""
+        few: dict[str, Any] = {}
+        if bands and self.bands > FEW_BANDS:
+            few["bands"] = FEW_BANDS
+        if layers and self.layers > FEW_LAYERS:
+            few["layers"] = FEW_LAYERS
+        return few
+
+
+def _blur(view: _View) -> Iterator[Ladder]:
+    label = f"{view.row.physics}, {view.row.method}"
+    levels = [Level("none", {"blur": False}), Level(label, {})]
+    if view.trained:
+        levels = levels[1:]  # a parameter of the lens that trains acts through it
+    yield Ladder("diffraction", levels, view.beside, blurs=False)
+
+
+def _model(view: _View) -> Iterator[Ladder]:
+    """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
+    imaging = view.imaging
+    if imaging.propagator != "nonparaxial" or not imaging.lens.has_pixels:
+        return
+    levels = [Level("fresnel", {"propagator": "fresnel"}), Level("nonparaxial", {})]
+    yield Ladder("model", levels, view.beside)
+
+
+def _sampling(view: _View) -> Iterator[Ladder]:
+    if not view.row.on_grid or view.imaging.samples is not None:
+        return
+    own = view.imaging.kappa or KAPPA
+    levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
+    yield Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.beside)
+
+
+def _precision(view: _View) -> Iterator[Ladder]:
+    imaging, dtype = view.imaging, view.scene.dtype
+    if imaging.precision == "float64" or (imaging.precision is None and dtype == torch.float64):
+        levels = [Level("float32", {"precision": "float32"}), Level("float64", {})]
+        yield Ladder("precision", levels, view.beside)
+
+
+def _wavelengths(view: _View) -> Iterator[Ladder]:
+    levels = [Level(f"{n} PSFs", {"bands": n}, n) for n in BANDS if n < view.bands]
+    top = Level(f"{view.bands} PSFs", {}, view.bands)
+    yield Ladder("wavelengths", [*levels, top], view.few(bands=False), successive=True)
+
+
+def _rank(view: _View) -> Iterator[Ladder]:
+    """Priced without blur, which only smooths what is missing."""
+    own = view.scene.coefficients.shape[1]
+    if view.scene.spectra is None and own > 1:
+        levels = [Level(f"rank {rank}", {"rank": rank}, rank) for rank in RANKS if rank < own]
+        yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False})
+
+
+def _depth(view: _View) -> Iterator[Ladder]:
+    """Layers, and what hides what: that depends on how many there are."""
+    if view.layers == 1:
+        return
+    names = {1: "one plane"}
+    levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in LAYERS if n < view.layers]
+    top = Level(f"{view.layers} layers", {}, view.layers)
+    layers = Ladder("depth", [*levels, top], view.few(layers=False), successive=True)
+    yield layers
+    if view.imaging.occlusion:
+        levels = [Level("none", {"occlusion": False}), Level("over", {})]
+        yield Ladder("occlusion", levels, view.few(layers=False), follows=layers)
+
+
+def _support(view: _View) -> Iterator[Ladder]:
+    def level(side: int, *, renormalise: bool) -> Level:
+        shape = (min(side, view.window[0]), min(side, view.window[1]))
+        changes = {"psf_shape": shape} | ({"renormalise": True} if renormalise else {})
+        return Level(f"{shape[0]} x {shape[1]} px" + (", rescaled" if renormalise else ""), changes, side)
+
+    largest = max(view.window)
+    levels = [level(side, renormalise=False) for side in WINDOWS if side < largest]
+    top = Level(f"{view.window[0]} x {view.window[1]} px", {}, largest)
+
+    def rescaled(plain: Level) -> list[Level]:
+        return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
+
+    yield Ladder("PSF support", [*levels, top], view.beside, alternatives=rescaled)
+
+
+LADDERS: Sequence[Callable[[_View], Iterator[Ladder]]] = (
+    _blur,
+    _model,
+    _sampling,
+    _precision,
+    _wavelengths,
+    _rank,
+    _depth,
+    _support,
+)

@@ -1,0 +1,354 @@
+"""Making a plan: climb from the cheapest physics until the errors fit the tolerance."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from kcam.camera import Camera
+from kcam.context import Context
+from kcam.effects import Work
+from kcam.optics import Imaging
+from kcam.planner import costs
+from kcam.planner.ladders import Ladder, ladders
+from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw
+from kcam.planner.trials import Trials
+from kcam.scene import Scene
+from kcam.sensor import ADC, ColourFilter, ShotNoise
+from kcam.sensor.noise import RandomStage
+
+SENSOR = "sensor"
+"""The tolerance that follows from what a sensor records."""
+
+NOISE_SHARE = 0.1
+"""Of all noise, that a source may be and be left out where the sensor sets the tolerance: 0.5 % of the sum."""
+
+Signals = Sequence[Mapping[int, tuple[torch.Tensor, Context]]]
+"""For each sample, what the stages of the sensor are given."""
+
+TILES = (256, 512, 1024)
+GAIN = 0.98  # of the time, that a choice must leave to be considered
+
+
+def make_plan(
+    camera: Camera,
+    scenes: Scene | Sequence[Scene],
+    *,
+    tolerance: float | str,
+    max_memory: float | None = None,
+) -> Plan:
+    """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
+
+    A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
+    until the sum of all errors is below the tolerance / `SAFETY`. The way up does not depend on the tolerance: with a
+    smaller one it goes further.
+
+    Args:      scenes: one or several, of the same wavelengths.
+               tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this
+               sensor records of this exposure, its noise and half a step of its ADC.
+               max_memory: bytes for the transforms; None for the camera's own.
+    Raises:    ValueError for a tolerance or a memory out of range, or no scenes; TypeError for other things than
+               scenes.
+    """
+    _check_tolerance(tolerance)
+    return Planner(camera, scenes, max_memory=max_memory).plan(tolerance)
+
+
+class Planner:
+    """Plans for one camera and some scenes; what was tried for one tolerance is known for the next.
+
+    Arguments and errors: as `make_plan`.
+    """
+
+    def __init__(
+        self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None
+    ) -> None:
+        start = time.perf_counter()
+        self.camera = camera
+        self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+        _check_scenes(self.scenes, max_memory)
+        self.trials = Trials(camera, self.scenes)
+        always = {} if max_memory is None else {"max_memory": float(max_memory)}
+        self.prices = _Prices(camera, self.trials, self.scenes, always)
+        self._known: tuple[list[Ladder], list[_Skip], Signals] | None = None
+        self._setup = time.perf_counter() - start
+
+    def plan(self, tolerance: float | str) -> Plan:
+        """The plan for a tolerance."""
+        start = time.perf_counter()
+        _check_tolerance(tolerance)
+        rows = _Rows(self.prices)
+        skipped: list[int] = []
+        allowed = 0.0
+        if tolerance != 0:
+            ladders, skips, signals = self._ways()
+            noise = max((self.trials.noise(given) for given in signals), default=0.0)
+            allowed = noise if isinstance(tolerance, str) else float(tolerance)
+            movable: list[Any] = [*ladders, *skips]
+            for choice in movable:
+                choice.position = 0
+            _climb(ladders, [skip for skip in skips if skip.counted], self.trials, allowed / SAFETY)
+            skipped = _skipped(skips, allowed, noise if isinstance(tolerance, str) else None)
+            for ladder in _relevant(ladders):
+                rows.add_ladder(ladder)
+            rows.add_way()
+            for skip in skips:
+                rows.add_skip(skip, left_out=skip.index in skipped)
+            rows.add_saturation(self.camera, signals)
+        rows.add_memory()
+        errors = [row.error for row in rows.decisions if row.counted]
+        reference = self.prices.of({})
+        return Plan(
+            tolerance=tolerance,
+            allowed=allowed,
+            bound=sum(errors),
+            expected=math.sqrt(sum(error**2 for error in errors)),
+            decisions=tuple(rows.decisions),
+            changes=rows.changes,
+            skipped=tuple(skipped),
+            stages=tuple(type(stage).__name__ for stage in self.camera),
+            range=Range.of(self.scenes),
+            gradients=self.trials.gradients,
+            seconds=rows.spent[0],
+            memory=rows.spent[1],
+            reference_seconds=reference[0],
+            reference_memory=reference[1],
+            planning_seconds=self._setup + time.perf_counter() - start,
+        )
+
+    def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
+        """All choices, and what the stages of the sensor are given."""
+        if self._known is None:
+            steps = [ladder for ladder in ladders(self.trials, self.prices.scene) if self.prices.saves(ladder)]
+            signals = self.trials.signals(dict(steps[0].beside) if steps else {})
+            skips = [_Skip(self.camera, index, signals) for index in self.trials.skippable()]
+            self._known = steps, skips, signals
+        return self._known
+
+
+def explain(
+    camera: Camera, scene: Scene, *, tolerance: float | str, measure: bool = False, max_memory: float | None = None
+) -> Plan:
+    """A plan for a scene; with `measure`, also its true error and times: the raw with and without it, by turns.
+
+    Arguments and errors: as `make_plan`.
+    """
+    plan = make_plan(camera, scene, tolerance=tolerance, max_memory=max_memory)
+    return dataclasses.replace(plan, measured=measured(plan, camera, scene)) if measure else plan
+
+
+def measured(
+    plan: Plan, camera: Camera, scene: Scene, *, rounds: int = 3, truth: torch.Tensor | None = None
+) -> dict[str, float]:
+    """True error of a plan, and the median times of the raw with it and without, new optics at each call [s].
+
+    truth: the noiseless raw of the camera without a plan, where it is known.
+    """
+    found: dict[str, list[float]] = {"seconds": [], "reference_seconds": []}
+    error = plan.measure(camera, scene, truth=truth)
+    with torch.no_grad():
+        for _ in range(rounds):
+            for name, shot in (("seconds", plan.apply(camera)), ("reference_seconds", camera)):
+                raw = noiseless_raw(Camera(*(_forget(stage) for stage in shot), context=shot.context))
+                start = time.perf_counter()
+                raw(scene)
+                found[name].append(time.perf_counter() - start)
+    return {"error": error} | {name: statistics.median(times) for name, times in found.items()}
+
+
+def _forget(stage: Any) -> Any:
+    """An Imaging that has kept nothing from before."""
+    return stage.changed() if isinstance(stage, Imaging) else stage
+
+
+def _check_scenes(scenes: Sequence[Any], max_memory: float | None) -> None:
+    if not scenes:
+        raise ValueError("there is no scene to plan for. Give one, or several: camera.plan([scene, ...], ...).")
+    for scene in scenes:
+        if not isinstance(scene, Scene):
+            raise TypeError(f"a plan is for scenes, got {type(scene).__name__}. Use Scene.from_rgb(image, depth=2.0).")
+    if len({tuple(scene.wavelengths.tolist()) for scene in scenes}) > 1:
+        raise ValueError("the scenes have different wavelengths. Plan together for those of the same.")
+    if max_memory is not None and not max_memory > 0:
+        raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory:g}.")
+
+
+def _check_tolerance(tolerance: Any) -> None:
+    if isinstance(tolerance, str) and tolerance != SENSOR:
+        raise ValueError(f'unknown tolerance "{tolerance}": expected a number such as 0.01, or "{SENSOR}".')
+    number = isinstance(tolerance, (int, float)) and not isinstance(tolerance, bool)
+    if not isinstance(tolerance, str) and not (number and 0 <= tolerance < math.inf):
+        raise ValueError(f'tolerance must be a relative error >= 0 such as 0.01, or "{SENSOR}", got {tolerance!r}.')
+
+
+def _relevant(steps: Sequence[Ladder]) -> list[Ladder]:
+    """Ladders that matter: without blur, none of those that say how to compute it."""
+    sharp = any(ladder.level.changes.get("blur") is False for ladder in steps)
+    return [ladder for ladder in steps if not (sharp and ladder.blurs)]
+
+
+def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], trials: Trials, most: float) -> None:
+    """One rung at a time, on the ladder with the largest error, until their sum fits."""
+    movable: list[Any] = [skip for skip in skips if skip.counted]
+    while True:
+        relevant: list[Any] = [*_relevant(steps), *movable]
+        for ladder in relevant:
+            ladder.price(trials)
+        if sum(ladder.error for ladder in relevant) <= most:
+            return
+        max(relevant, key=lambda ladder: ladder.error).climb(trials)
+
+
+class _Skip:
+    """A stage that may be left out: a ladder of two rungs where its error counts."""
+
+    def __init__(self, camera: Camera, index: int, signals: Signals) -> None:
+        self.stage: Any = camera[index]
+        self.index, self.position = index, 0
+        self.counted = not isinstance(self.stage, (RandomStage, ADC))
+        found = [given[index] for given in signals]
+        errors = [self.stage.error_if_skipped(*signal) for signal in found]
+        worst = max(range(len(errors)), key=errors.__getitem__)
+        self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst])
+        self.passes = self.stage.cost(*found[worst])
+
+    @property
+    def error(self) -> float:
+        """Estimated, as it is now."""
+        return 0.0 if self.position else self.error_if_skipped
+
+    def price(self, trials: Trials) -> None:
+        """It is known."""
+
+    def climb(self, trials: Trials) -> None:
+        """Keep the stage."""
+        self.position = 1
+
+
+def _skipped(skips: Sequence[_Skip], allowed: float, noise: float | None) -> list[int]:
+    """Stages to leave out: those whose errors are in the sum, and noise and rounding that are small by themselves.
+
+    Together they stay below the tolerance; where the noise itself sets it, each source below a tenth of it.
+    """
+    chosen = [skip.index for skip in skips if skip.counted and not skip.position]
+    together = 0.0
+    for skip in sorted((skip for skip in skips if not skip.counted), key=lambda skip: skip.error):
+        together = math.hypot(together, skip.error)
+        if together <= (allowed if noise is None else NOISE_SHARE * noise):
+            chosen.append(skip.index)
+    return sorted(chosen)
+
+
+class _Prices:
+    """Predicted time and memory of the raw of the scene that takes longest."""
+
+    def __init__(self, camera: Camera, trials: Trials, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
+        self.imaging, self.always, self.rates = trials.imaging, always, costs.current_rates()
+        self.channels = self._channels(camera, scenes[0])
+        self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
+        self.scene = scenes[0]
+        self.scene = max(scenes, key=lambda scene: self._seconds(scene))
+
+    @staticmethod
+    def _channels(camera: Camera, scene: Scene) -> int | None:
+        for stage in camera:
+            if isinstance(stage, ColourFilter):
+                return stage.contraction(scene.wavelengths).shape[0]
+        return None
+
+    def _seconds(self, scene: Scene) -> float:
+        return 0.0 if self.imaging is None else costs.seconds(self._work(scene, {}), self.rates)
+
+    def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
+        if self.imaging is None:
+            return Work()
+        return self.imaging.changed(**self.always | dict(changes)).work(scene, channels=self.channels)
+
+    def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
+        """(seconds, bytes) with changes of the Imaging."""
+        key = tuple(sorted(changes.items()))
+        if key not in self.kept:
+            work = self._work(self.scene, changes)
+            self.kept[key] = (costs.seconds(work, self.rates), work.memory)
+        return self.kept[key]
+
+    def saves(self, ladder: Ladder) -> bool:
+        """Whether its cheapest rung takes less time than its top."""
+        return self.of(ladder.levels[0].changes)[0] <= GAIN * self.of({})[0] or len(ladder.levels) == 1
+
+
+@dataclass(frozen=True)
+class _Way:
+    """How to convolve: with one result."""
+
+    label: str
+    changes: dict[str, Any]
+
+
+class _Rows:
+    """The decisions, one after the other, and what is spent after each."""
+
+    def __init__(self, price: _Prices) -> None:
+        self.price = price
+        self.decisions: list[Decision] = []
+        self.changes: dict[str, Any] = dict(price.always)
+        self.spent = price.of(self.changes)
+
+    def _add(self, effect: str, chosen: str, instead: str, why: str, error: float = 0.0, counted: bool = True) -> None:
+        self.decisions.append(Decision(effect, chosen, instead, why, error, counted, *self.spent))
+
+    def add_ladder(self, ladder: Ladder) -> None:
+        """A choice of optics."""
+        self.changes |= ladder.level.changes
+        self.spent = self.price.of(self.changes)
+        top = ladder.levels[-1].label
+        instead = "" if ladder.level.label == top else top
+        self._add(ladder.effect, ladder.level.label, instead, ladder.why(), ladder.error)
+
+    def add_way(self) -> None:
+        """The convolution, by predicted time alone: all ways have one result."""
+        if self.price.imaging is None:
+            return
+        whole = _Way("by FFT, whole", {})
+        ways = [whole, _Way("direct", {"direct": True})]
+        side = max(self.price.scene.shape[1:])
+        ways += [_Way(f"by FFT, {tile} px tiles", {"tile": tile}) for tile in TILES if tile < side]
+        best = min(ways, key=lambda way: self.price.of(self.changes | way.changes)[0])
+        before = self.price.of(self.changes)[0]
+        after = self.price.of(self.changes | best.changes)[0]
+        self.changes |= best.changes
+        self.spent = self.price.of(self.changes)
+        why = "" if best is whole else f"{before / max(after, 1e-12):.2g} times as fast"
+        self._add("convolution", best.label, "" if best is whole else whole.label, why)
+
+    def add_skip(self, skip: _Skip, *, left_out: bool) -> None:
+        """A stage of the sensor, or of the user's."""
+        name = type(skip.stage).__name__
+        error = skip.error_if_skipped if left_out or not skip.counted else 0.0
+        chosen, instead = ("left out", "kept") if left_out else ("kept", "")
+        self._add(name, chosen, instead, skip.reason, error, skip.counted)
+
+    def add_saturation(self, camera: Camera, signals: Signals) -> None:
+        """What the full well cuts off."""
+        for index, stage in enumerate(camera):
+            if isinstance(stage, ShotNoise):
+                peak = max((float(given[index][0].max()) for given in signals if given[index][0].numel()), default=0.0)
+                why = f"the brightest pixel fills {peak:.2g} of the well"
+                self._add("saturation", "kept", "", why)
+            if isinstance(stage, ENDS):
+                return
+
+    def add_memory(self) -> None:
+        """How the work is split."""
+        if self.price.imaging is None:
+            return
+        most = self.changes.get("max_memory", self.price.imaging.max_memory)
+        now, before = (f"{memory / 1e6:.0f} MB" for memory in (self.spent[1], self.price.of({})[1]))
+        self._add("memory", now, before, f"max_memory {most / 1e6:.0f} MB")
