@@ -67,7 +67,7 @@ class Renderer:
         return self._tiles(planes, self._blur(self.psfs[layer]))
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
-        """How a layer's mask (B, 1, H, W) spreads in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
+        """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
         kernels = self._of_bands(self.psfs[layer])
         if self.weights is not None:
             kernels = torch.einsum("cg,gyx->cyx", self._grouped(self.weights), self.psfs[layer])
@@ -237,15 +237,15 @@ def rendering_work(
         inputs, kernels = (planes if factored else bands), bands
         products, held = bands * (1 + channels + (planes if factored else 0)), inputs + 2 * sizes.bands + 2 * channels
     if direct:
-        summed = products + (out if coverage else 0)
+        summed = products + (2 * out if coverage else 0)
         touched = (inputs + 2 * out) * pixels + mixed
         memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
         return Work({"product": float(summed * pixels * kernel), "touch": touched}, memory)
     transforms = tiles * (inputs + out) + kernels
     touched = float(tiles * points * (inputs + out + products) + kernels * points) + mixed
     if coverage:
-        transforms += tiles * (1 + out) + out
-        touched += tiles * points * (1 + 3 * out) + 6 * out * pixels
+        transforms += tiles * 2 * (1 + out) + out
+        touched += tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
     memory = float(itemsize * (held * points + (inputs + out) * pixels))
     return Work({"transform": transforms * points * math.log2(max(2, points)), "touch": touched}, memory)
 

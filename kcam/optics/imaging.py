@@ -40,7 +40,8 @@ class Imaging(Stage):
 
     Args:
         lens: the optics.
-        pixel_pitch: [m]. fill_factor: light-sensitive share of a pixel; the irradiance is its mean over that square.
+        pixel_pitch: [m]. fill_factor: light-sensitive share of a pixel; the irradiance is its mean over that square,
+            and an even scene gives the same whatever the share.
         propagator, method, samples: as in `Lens.psf`. A number of samples freezes the pupil grid, which otherwise
             follows the parameters in steps: give it together with psf_shape where a camera is differenced. A propagator
             may also be a row of one's own, an `optics.propagation.Propagator`; such a camera cannot be saved.
@@ -183,21 +184,24 @@ class Imaging(Stage):
     def depth_layers(self, depth: Tensor, wavelengths: Tensor) -> Tensor:
         """Vergences of the layers that a depth map is cut into, ascending (Z,) [1/m]: equal steps of <= 0.125 waves.
 
-        A step dV in vergence is a^2 dV / (2 lambda) waves of defocus at the rim.
+        A step dV in vergence is a^2 dV / (2 lambda) waves of defocus at the rim. Their ends carry the gradient of the
+        map's nearest and farthest point; their number follows the map in steps.
         """
-        vergence = 1 / depth.detach().to(torch.float64)
+        vergence = 1 / depth.to(torch.float64)
         if not self.blur:
             return vergence.flatten()[:1]
-        low, high = float(vergence.min()), float(vergence.max())
-        if low == high:
-            return torch.tensor([low], dtype=torch.float64)
+        low, high = vergence.min(), vergence.max()
+        span = float((high - low).detach())
+        if span == 0:
+            return vergence.mean()[None] if vergence.requires_grad else low[None]
         count = self.layers
         if count is None:
             semi = float(self.lens.aperture.semi_aperture().detach())
-            count = 1 + math.ceil((high - low) * semi**2 / (2 * float(wavelengths.min())) / LAYER_WAVES)
+            count = 1 + math.ceil(span * semi**2 / (2 * float(wavelengths.min())) / LAYER_WAVES)
         if count == 1:
-            return torch.tensor([(low + high) / 2], dtype=torch.float64)
-        return torch.linspace(low, high, count, dtype=torch.float64)
+            return (low + high)[None] / 2
+        share = torch.linspace(0, 1, count, dtype=torch.float64, device=vergence.device)
+        return low + (high - low) * share
 
     # ---- scene and optics ------------------------------------------------------------------------------------------
 
@@ -221,10 +225,10 @@ class Imaging(Stage):
         )
 
     def _query(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Query:
-        distances = 1 / vergences.detach().to(torch.float64)
+        vergences = vergences.to(torch.float64)
         query = self.lens.query(
             wavelengths,
-            distances=distances,
+            distances=1 / vergences.detach(),
             pixel_pitch=self.pixel_pitch,
             shape=shape,
             samples=self.samples,
@@ -233,6 +237,8 @@ class Imaging(Stage):
             dtype=like.dtype,
             device=like.device,
         )
+        if vergences.requires_grad:  # not through 1 / distance, which has no slope at infinity
+            query = replace(query, vergences=vergences.to(query.device))
         return query if self.kappa is None else replace(query, kappa=self.kappa)
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
@@ -268,12 +274,18 @@ class Imaging(Stage):
         query = self._query(self._psf_wavelengths(wavelengths), vergences, shape, like)
 
         def build() -> Tensor:
-            psfs = choose(query, propagator=self.propagator, method=self.method)(query)
+            row = choose(query, propagator=self.propagator, method=self.method)
+            psfs = row(query)
+            if query.active < 1 and not self.renormalise:
+                # a scene's pixel is a point here: a sensitive part that it hits or misses would gain or lose its light
+                whole = row(replace(query, active=1.0)).sum((-2, -1), keepdim=True)
+                psfs = psfs / psfs.sum((-2, -1), keepdim=True) * whole
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.renormalise else psfs
 
-        if torch.is_grad_enabled() and any(p.requires_grad for p in self.lens.parameters()):
+        trained = vergences.requires_grad or any(p.requires_grad for p in self.lens.parameters())
+        if torch.is_grad_enabled() and trained:
             return build()
-        return self._bank_cache.get(self._optics_key(wavelengths, vergences, shape, like), build)
+        return self._bank_cache.get(self._optics_key(wavelengths, vergences.detach(), shape, like), build)
 
     def _optics_key(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> tuple:
         how = (self.propagator, self.method, self.samples, self.integrate, self.bands, self.kappa, self.renormalise)
@@ -284,7 +296,8 @@ class Imaging(Stage):
         """Share of each pixel in each layer, linear in vergence between neighbours or all in the nearest: (B, Z, H, W),
         sums to 1.
         """
-        position = (1 / depth - vergences[0].item()) / float(vergences[1] - vergences[0])
+        first, second = vergences[:2].to(depth.device)
+        position = (1 / depth - first) / (second - first)
         position = position if self.interpolate else position.round()
         layers = torch.arange(vergences.numel(), device=depth.device, dtype=torch.float64)
         return torch.clamp(1 - (position - layers[:, None, None]).abs(), min=0)
@@ -396,20 +409,20 @@ def _map_work(query: Query) -> float:
 class _Layers:
     """Depth layers from far to near: each is blurred with its own coverage and laid over what is behind it.
 
-    E_k = sum over layers up to k of (K * m),  l_k = (h * m_k I) / E_k,  a_k = (K * m_k) / E_k,  out <- l_k + (1 - a_k)
-    out
+    E_k = K_k * sum_(j <= k) m_j,   l_k = (h_k * m_k I) / E_k,   a_k = (K_k * m_k) / E_k,   out <- l_k + (1 - a_k) out
 
-    with K the PSFs weighted by the channel's filter, relative to their own sum: coverage per *channel*, so that the
-    sum over wavelengths stays inside the transform. Dividing by E_k extends each layer behind the nearer ones, whose
-    blurred edge would otherwise show black. Where all layers share one PSF this is exactly the plain convolution.
-    Without occlusion the layers are added up as they are.
+    with K_k the PSFs of layer k weighted by the channel's filter, relative to their own sum: coverage per *channel*, so
+    that the sum over wavelengths stays inside the transform. Dividing by E_k, the share of what is not hidden by nearer
+    layers, extends each layer behind those, whose blurred edge would otherwise show black. The nearest layer has
+    E = 1: its blurred mask covers what is behind. Where all layers share one PSF this is exactly the plain
+    convolution. Without occlusion the layers are added up as they are.
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
     """
 
     def __init__(self, planes: Tensor, shares: Tensor | None, *, occlusion: bool) -> None:
         self.planes, self.shares, self.occlusion = planes, shares, occlusion
         self.light: Tensor = planes.new_zeros(())
-        self._covered: Tensor = planes.new_zeros(())
+        self._unhidden = planes.new_zeros(())  # pixels that lie in the layers so far
 
     def add(self, renderer: Renderer, *, first: int) -> None:
         """Lay the layers of one bank of PSFs, `first` and the following, over those before."""
@@ -422,8 +435,8 @@ class _Layers:
             if not self.occlusion:
                 self.light = self.light + light
                 continue
-            cover = renderer.coverage(share, layer=layer)
-            self._covered = self._covered + cover
-            floor = self._covered.clamp(min=_COVERAGE_FLOOR)
+            self._unhidden = self._unhidden + share
+            cover, unhidden = renderer.coverage(torch.cat([share, self._unhidden]), layer=layer).chunk(2)
+            floor = unhidden.clamp(min=_COVERAGE_FLOOR)
             opacity = (cover / floor).clamp(0, 1)
             self.light = light / floor + (1 - opacity) * self.light

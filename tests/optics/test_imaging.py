@@ -828,3 +828,54 @@ def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: i
 
     inputs = (planes, psfs, weights) if spectra is None else (planes, psfs, weights, spectra)
     assert torch.autograd.gradcheck(contract, inputs)
+
+
+# ---- what a new user found ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("focus", [1.0, 2.0], ids=["near", "far"])
+def test_a_black_object_before_a_white_wall_covers_it_with_its_blurred_mask(focus: float) -> None:
+    """Whatever the wall's blur: 1 - K * mask, K the object's PSF. A halo of the wall's light lay over the object once.
+
+    6e-3: the light that the two windows leave out, which the picture bounds here to 61 pixels.
+    """
+    optic = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(20 * mm), focus_distance=focus)
+    mask = (torch.arange(121) < 60).double().expand(28, 61, 121)
+    depth = torch.where(mask[:1, None] > 0, 1.0, 2.0)
+    stage = optics.Imaging(optic, pixel_pitch=PITCH)
+    seen = stage(Scene.from_bands(1 - mask, depth=depth))
+    truth = 1 - stage(Scene.from_bands(mask, depth=1.0))
+    assert float((seen - truth)[..., 20:100].abs().max()) < 6e-3
+    assert float(seen[..., 30:100].diff().min()) > -1e-9  # no hard edge, no halo
+
+
+@pytest.mark.parametrize("case", ["one distance", "a number", "two planes", "close planes"])
+def test_gradients_reach_the_depth(case: str) -> None:
+    """Also where all pixels, or the nearest and farthest, lie in one layer: the layer moves with them."""
+    depth = {
+        "one distance": torch.full((1, 1, 17, 19), 2.0, dtype=torch.float64),
+        "a number": torch.tensor(2.0, dtype=torch.float64),
+        "two planes": torch.where(torch.arange(19) < 9, 2.0, 2.5).double().expand(1, 1, 17, 19),
+        "close planes": torch.where(torch.arange(19) < 9, 2.0, 2.01).double().expand(1, 1, 17, 19),
+    }[case]
+    stage = imaging(psf_shape=(17, 17))
+
+    def energy(depth: Tensor) -> Tensor:
+        scene = Scene.from_rgb(random(1, 3, 17, 19), depth=depth, wavelengths=wavelength_grid(count=3))
+        return stage(scene).square().sum()
+
+    moved = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(energy(depth + moved), moved)
+    step = 1e-5
+    expected = float(energy(depth + step) - energy(depth - step)) / (2 * step)
+    assert float(found) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("fill_factor", [0.9, 0.5, 0.1])
+def test_an_even_scene_is_as_bright_whatever_the_fill_factor(fill_factor: float) -> None:
+    white = Scene.from_bands(torch.ones(1, 3, 24, 24, dtype=torch.float64), wavelengths=wavelength_grid(count=3))
+    sharp = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(20 * mm), focus_distance=2.0)
+    whole, part = (
+        optics.Imaging(sharp, pixel_pitch=3 * um, fill_factor=f, psf_shape=(25, 25))(white) for f in (1.0, fill_factor)
+    )
+    torch.testing.assert_close(part, whole, rtol=1e-9, atol=1e-9)
