@@ -8,8 +8,9 @@ factors, and back once per channel, not once per band.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -111,12 +112,17 @@ class Renderer:
         weights, spectra, convolution = self.weights, self.spectra, self.convolution
         if weights is None:
             return lambda planes: self._per_band(planes, self._of_bands(psfs))
-        if spectra is not None:
-            mixing = self._grouped(weights[:, None] * spectra)  # (C, K, G)
-            if self.direct or self.owner is not None or mixing.shape[0] * mixing.shape[1] <= psfs.shape[0]:
-                return self._by_kernels(mixing, psfs)
-        elif self.direct or (self.owner is not None and weights.shape[0] * psfs.shape[0] < weights.shape[1]):
-            return self._by_groups(weights, psfs)
+        ways = _ways(
+            planes=None if spectra is None else spectra.shape[0],
+            bands=weights.shape[1],
+            groups=psfs.shape[0],
+            channels=weights.shape[0],
+            direct=self.direct,
+        )
+        if ways == "kernels" and spectra is not None:
+            return self._by_kernels(self._grouped(weights[:, None] * spectra), psfs)
+        if ways == "groups":
+            return self._by_groups(self._group_mixing(weights, spectra), psfs)
         psfs = self._of_bands(psfs)
         count, kept = psfs.shape[0], None
         if self._keeps(count, psfs):
@@ -142,25 +148,39 @@ class Renderer:
 
         return blur
 
-    def _by_groups(self, weights: Tensor, psfs: Tensor) -> Callable[[Tensor], Tensor]:
-        """sum_g h_g (sum_(l in g) kappa_cl I_l): for few PSFs the bands are contracted before the transform."""
-        channels, count = weights.shape[0], psfs.shape[0]
-        if self.owner is None:
-            owner = torch.arange(count, device=weights.device)
-        else:
-            owner = self.owner.to(weights.device)
-        mixing = weights[:, None] * (owner == torch.arange(count, device=weights.device)[:, None])  # (C, G, L)
+    def _group_mixing(self, weights: Tensor, spectra: Tensor | None) -> Tensor:
+        """How much of each plane each channel gets through each PSF, (C, K, G)."""
+        count = self.psfs.shape[1]
+        owner = torch.arange(count) if self.owner is None else self.owner
+        of_group = (owner[:, None] == torch.arange(count)).to(weights)  # (L, G)
+        if spectra is None:
+            return weights[:, :, None] * of_group
+        return torch.einsum("cl,kl,lg->ckg", weights, spectra, of_group)
+
+    def _by_groups(self, mixing: Tensor, psfs: Tensor) -> Callable[[Tensor], Tensor]:
+        """sum_g h_g (sum_k M_ckg C_k): for few PSFs the planes are contracted, before the transform."""
         convolution = self.convolution
-        transfers = None
-        if not self.direct:
-            transfers = self._transfers(count, lambda: convolution.transfer(psfs), psfs)
+
+        def parts(planes: Tensor) -> Iterator[Tensor]:
+            return (torch.einsum("ck,bkhw->bchw", mixing[..., index], planes) for index in range(psfs.shape[0]))
+
+        if self.direct:
+
+            def in_picture(planes: Tensor) -> Tensor:
+                total = planes.new_zeros(())
+                for psf, part in zip(psfs, parts(planes), strict=True):
+                    extended = extend(part, self.window, self.border).flatten(0, 1)[:, None]
+                    total = total + torch.nn.functional.conv2d(extended, psf[None, None]).unflatten(0, part.shape[:2])
+                return total.squeeze(2)
+
+            return in_picture
+        transfers = self._transfers(psfs.shape[0], lambda: convolution.transfer(psfs), psfs)
 
         def blur(planes: Tensor) -> Tensor:
-            groups = torch.einsum("cgl,blhw->bcghw", mixing, planes)
-            if transfers is not None:
-                return convolution.back((convolution.transform(groups) * transfers).sum(2))
-            extended = extend(groups, self.window, self.border).flatten(0, 1)
-            return torch.nn.functional.conv2d(extended, psfs[None]).unflatten(0, (-1, channels))[:, :, 0]
+            spectra = (
+                convolution.transform(part) * transfer for part, transfer in zip(parts(planes), transfers, strict=True)
+            )
+            return convolution.back(functools.reduce(torch.add, spectra))
 
         return blur
 
@@ -201,6 +221,23 @@ class Renderer:
         return self.cache.get((*sources, self.convolution.size), build)
 
 
+def _ways(*, planes: int | None, bands: int, groups: int, channels: int, direct: bool) -> str:
+    """What is contracted first: the PSFs to "kernels", the planes to "groups" of one PSF each, or the spectra in
+    "bands". Counted in transforms; ten products of two planes take the time of one.
+
+    planes: None where they are the bands.
+    """
+    count = bands if planes is None else planes
+    costs = {"groups": groups * (channels + 1.0)}
+    if planes is not None:
+        costs["kernels"] = planes * (channels + 1.0)
+        if channels * planes <= groups:  # measured: the kernels' own contraction runs well
+            return "kernels"
+    if not direct:
+        costs["bands"] = count + bands + bands * (1 + channels + (planes or 0)) / 10
+    return min(costs, key=costs.__getitem__)
+
+
 def rendering_work(
     picture: tuple[int, int],
     window: tuple[int, int],
@@ -227,15 +264,19 @@ def rendering_work(
     held: float
     if channels is None:
         inputs, kernels, products, held = bands, bands, bands, 4 + bands * pixels / points
-    elif factored and (direct or groups < bands or channels * planes <= bands):
-        inputs, kernels, products = planes, channels * planes, channels * planes
-        mixed, held = mixed + kernels * groups * kernel, inputs + kernels + 3 + channels
-    elif not factored and (direct or channels * groups < bands):
-        inputs, kernels, products = channels * groups, groups, channels * groups
-        mixed, held = mixed + inputs * bands * pixels / 8, 2 * inputs + groups
     else:
-        inputs, kernels = (planes if factored else bands), bands
-        products, held = bands * (1 + channels + (planes if factored else 0)), inputs + 2 * sizes.bands + 2 * channels
+        own = planes if factored else None
+        way = _ways(planes=own, bands=bands, groups=groups, channels=channels, direct=direct)
+        if way == "kernels":
+            inputs, kernels, products = planes, channels * planes, channels * planes
+            mixed, held = mixed + kernels * groups * kernel, inputs + kernels + 3 + channels
+        elif way == "groups":
+            inputs, kernels, products = channels * groups, groups, channels * groups
+            mixed, held = mixed + inputs * planes * pixels / 8, 3 * channels + groups
+        else:
+            inputs, kernels = (planes if factored else bands), bands
+            products = bands * (1 + channels + (planes if factored else 0))
+            held = inputs + 2 * sizes.bands + 2 * channels
     if direct:
         summed = products + (2 * out if coverage else 0)
         touched = (inputs + 2 * out) * pixels + mixed
