@@ -1,4 +1,4 @@
-"""The command `kcam`: demo, shoot, psf, tradeoff. The one place where quantities are strings with units."""
+"""The command `kcam`: demo, shoot, psf, explain, calibrate, tradeoff. Only here are quantities strings with units."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
+TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; without it, everything'
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="of the noise")]
 CameraOption = Annotated[
     str, typer.Option("--camera", help="thesis, ideal, phone, singlet, or a file that Camera.save wrote")
@@ -175,6 +176,7 @@ def shoot(
     distance: Annotated[str, typer.Option("--distance", help='of the scene, in metres: 2, "50 cm", inf')] = "2 m",
     out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("shot.png"),
     seed: SeedOption = 0,
+    tolerance: Annotated[str, typer.Option("--tolerance", help=TOLERANCE)] = "",
 ) -> None:
     """Photograph a photograph: what this camera would have seen at that distance. The picture keeps its size."""
     with one_line_errors():
@@ -192,6 +194,9 @@ def shoot(
             if isinstance(stage, optics.Imaging):
                 check_not_too_near(stage, length(distance), shape=scene.shape[1:])
         generator = torch.Generator().manual_seed(seed)
+        if tolerance:
+            with torch.no_grad(), progress("plan"):
+                stages = stages.plan(scene, tolerance=as_tolerance(tolerance)).apply(stages)
         with torch.no_grad(), progress("shoot", total=len(stages)) as advance:
             for name, picture in stages.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
                 advance(name)
@@ -235,6 +240,60 @@ def psf(
             )
         plots.save_figure(figure, out)
         typer.echo(out)
+
+
+@app.command()
+def explain(
+    photo: Annotated[str, typer.Argument(help="a picture, or a built-in scene such as motorcycle, which has depth")],
+    camera: CameraOption = "phone",
+    tolerance: Annotated[str, typer.Option("--tolerance", help='of the raw: 0.01, or "sensor"')] = "0.01",
+    distance: Annotated[str, typer.Option("--distance", help='of a picture: 2, "50 cm", inf')] = "2 m",
+    size: Annotated[int, typer.Option("--size", min=0, help="of the longer side [pixels]; 0: as it is")] = 0,
+    measure: Annotated[bool, typer.Option("--measure", help="also the true error and times")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="save the plan, as JSON")] = None,
+) -> None:
+    """Say which effects a camera must simulate for a scene, within a tolerance, and what the others would cost."""
+    with one_line_errors():
+        import torch
+
+        from kcam import planner
+        from kcam.scene import BUILTIN, Scene
+
+        stages = open_camera(camera)
+        if photo in BUILTIN:
+            scene = Scene.builtin(photo, size or None)
+        else:
+            scene = Scene.from_file(photo, depth=length(distance))
+            scene = scene.resized(size) if size else scene
+        with torch.no_grad(), progress("explain"):
+            plan = planner.explain(stages, scene, tolerance=as_tolerance(tolerance), measure=measure)
+        typer.echo(plan)
+        if out is not None:
+            plan.save(out)
+            typer.echo(out)
+
+
+def as_tolerance(text: str) -> float | str:
+    """A number, or "sensor". Raises: ValueError for anything else."""
+    if text == "sensor":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f'tolerance "{text}" is no relative error: expected e.g. 0.01, or sensor.') from None
+
+
+@app.command()
+def calibrate() -> None:
+    """Measure how fast this machine computes, half a minute, so that plans predict its times; kept in a file."""
+    with one_line_errors():
+        from kcam.planner import costs
+
+        with progress("calibrate") as advance:
+            rates, off = costs.calibrate(advance=advance)
+        path = costs.save_rates(rates)
+        typer.echo(f"predictions of single pictures are off by a factor of {off:.2f} in the median")
+        typer.echo(path)
 
 
 @app.command()

@@ -5,6 +5,7 @@ To add a choice, write a function that gives its ladder, and a row of `LADDERS`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,8 +18,8 @@ from kcam.optics.sampling import KAPPA
 from kcam.planner.trials import Trials
 from kcam.scene import Scene
 
-FEW_BANDS, FEW_LAYERS = 3, 3
-"""Of the settings beside which a choice is priced."""
+FEW_BANDS, FEW_LAYERS, TAIL = 3, 3, 16
+"""Of the settings beside which a choice is priced: wavelengths, layers, and pixels of the PSF beyond its rays."""
 
 ORDER = 1.5
 """A ladder's error falls at least with this power of its step: two where it is fine enough, one where phases jump."""
@@ -78,6 +79,9 @@ class Ladder:
         key = self._key(self.position)
         if self.position == len(self.levels) - 1 or key in self.errors:
             return
+        if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing
+            self.errors[key] = 0.0
+            return
         beside = self.beside | (self.follows.level.changes if self.follows else {})
         upper = self.levels[self.position + 1] if self.successive else self.levels[-1]
         candidates = [self.level] + (self.alternatives(self.level) if self.alternatives else [])
@@ -122,18 +126,23 @@ class _View:
         self.layers = len(imaging.depth_layers(depth, scene.wavelengths)) if depth.numel() else 1
         self.bands = min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
-        query = imaging._query(scene.wavelengths, self.vergences[:1], self.window, planes)
+        ends = torch.stack([self.vergences.min(), self.vergences.max()])
+        query = imaging._query(scene.wavelengths, ends, self.window, planes)
+        self.blur = float(query.displacement.max()) + imaging.lens.pixel_phase_displacement(query)
         self.row = choose(query, propagator=imaging.propagator, method=imaging.method)
         self.trained = any(p.requires_grad for p in imaging.lens.parameters())
         self.beside = self.few()
 
-    def few(self, *, bands: bool = True, layers: bool = True) -> dict[str, Any]:
+    def few(self, *, bands: bool = True, layers: bool = True, window: bool = True) -> dict[str, Any]:
         """Cheap settings of the others."""
         few: dict[str, Any] = {}
         if bands and self.bands > FEW_BANDS:
             few["bands"] = FEW_BANDS
         if layers and self.layers > FEW_LAYERS:
             few["layers"] = FEW_LAYERS
+        core = 2 * (math.ceil(self.blur / self.imaging.pixel_pitch) + TAIL) + 1
+        if window and core < 0.75 * max(self.window):
+            few["psf_shape"] = (min(core, self.window[0]), min(core, self.window[1]))
         return few
 
 
@@ -210,7 +219,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    yield Ladder("PSF support", [*levels, top], view.beside, alternatives=rescaled)
+    yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled)
 
 
 LADDERS: Sequence[Callable[[_View], Iterator[Ladder]]] = (

@@ -234,7 +234,7 @@ def _contrast(scene: Scene) -> float:
 
 # ---- the table -----------------------------------------------------------------------------------------------------
 
-WIDTHS = (13, 19, 16, 24, 8, 8, 6)  # effect, chosen, instead of, why, error, time, memory: 100 columns in all
+WIDTHS = (13, 19, 16, 23, 9, 8, 6)  # effect, chosen, instead of, why, error, time, memory: 100 columns in all
 
 
 def _table(plan: Plan) -> str:
@@ -257,16 +257,21 @@ def _table(plan: Plan) -> str:
 
 
 def _summary(plan: Plan) -> list[str]:
-    share = plan.planning_seconds / max(plan.reference_seconds, 1e-9)
     text = (
         f"Error of the noiseless raw: at most {plan.bound:.2g}, {plan.expected:.2g} expected (allowed "
-        f"{plan.allowed:.3g}; in brackets: noise and rounding, outside the sum). Time of the raw "
-        f"{_time(plan.seconds)} instead of {_time(plan.reference_seconds)}, "
-        f"{plan.reference_seconds / max(plan.seconds, 1e-9):.3g} times as fast; memory {plan.memory / 1e6:.0f} MB "
-        f"instead of {plan.reference_memory / 1e6:.0f}. Planning took {_time(plan.planning_seconds)}, "
-        f"{share:.0%} of the reference's predicted time"
-        + (": it pays for several pictures, not for one." if share > 0.1 else ".")
+        f"{plan.allowed:.3g}; in brackets: noise and rounding, outside the sum)."
     )
+    if plan.reference_seconds > 0:
+        share = plan.planning_seconds / plan.reference_seconds
+        text += (
+            f" Time of the raw {_time(plan.seconds)} instead of {_time(plan.reference_seconds)}, "
+            f"{plan.reference_seconds / max(plan.seconds, 1e-9):.3g} times as fast; memory {plan.memory / 1e6:.0f} MB "
+            f"instead of {plan.reference_memory / 1e6:.0f}. Planning took {_time(plan.planning_seconds)}, "
+            f"{share:.0%} of the reference's predicted time"
+            + (": it pays for several pictures, not for one." if share > 0.1 else ".")
+        )
+    else:
+        text += " The camera has no optics to simplify."
     lines = textwrap.wrap(text, 100)
     if plan.measured:
         found = plan.measured

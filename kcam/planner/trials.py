@@ -27,7 +27,8 @@ from kcam.scene import Scene
 from kcam.sensor import ADC
 from kcam.sensor.noise import RandomStage
 
-LARGEST, CROP, CROPS = 256, 192, 3  # pixels of a scene that is tried whole; else crops of such a side, so many
+LARGEST = 320**2  # pixels of a scene that is tried whole
+CROP, CROPS = 160, 3  # else: side of the crops [pixels], and how many
 MOST = 4  # scenes of a batch
 
 
@@ -184,7 +185,7 @@ def _items(scene: Scene) -> list[Scene]:
 
 def _samples(scene: Scene, origin: int) -> list[Sample]:
     """A small scene whole; of a large one, crops: the most detailed of each of some strata of detail."""
-    if max(scene.shape[1:]) <= LARGEST or not scene.coefficients.numel():
+    if scene.shape[1] * scene.shape[2] <= LARGEST or not scene.coefficients.numel():
         return [Sample(scene, origin)]
     return _crops(scene, origin)
 

@@ -264,7 +264,7 @@ class RandomStage(Stage):
         """How many electrons it is, beside the signal's."""
         full_well = float(torch.as_tensor(self._resolve(context, None)[0]).detach().max())
         sigma, level = self.error_if_skipped(signal, context), _rms(signal) * full_well
-        return f"sigma {sigma * level:.3g} of {level:.3g} electrons"
+        return f"sigma {sigma * level:.3g} of {level:.{0 if level >= 10 else 2}f} electrons"
 
     def bypass(self) -> Mean:
         """What stands in for it when it is left out: its mean."""
