@@ -346,7 +346,8 @@ class Imaging(Stage):
             max_memory=self.max_memory,
             coverage=layers > 1 and self.occlusion,
         )
-        operations = {kind: number * layers * batch for kind, number in rendering.operations.items()}
+        scale = itemsize / 4  # twice as many bytes take twice as long
+        operations = {kind: number * layers * batch * scale for kind, number in rendering.operations.items()}
         operations["layer"] = float(layers)
         bank = 0.0
         groups = 1
@@ -356,7 +357,7 @@ class Imaging(Stage):
             query = self._query(grouped, vergences, window, planes)
             row = choose(query, propagator=self.propagator, method=self.method)
             at_once = min(layers, self._layers_at_once(bands, window, planes))
-            operations |= {row.method: row.cost(query), "bank": float(math.ceil(layers / at_once))}
+            operations |= {row.method: row.cost(query) * scale, "bank": float(math.ceil(layers / at_once))}
             operations["psf"] = float(layers * groups)
             if self.lens.has_pixel_phase:
                 operations["map"] = _map_work(query)

@@ -1,0 +1,369 @@
+"""Plans keep their word: errors inside the tolerance, estimates near the truth, and what is left out is said."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import statistics
+import warnings
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import kcam
+from benchmarks.planner import TOLERANCES, random_pair
+from kcam import Camera, Scene, isp, optics, sensor
+from kcam.planner import OutOfRange, Plan, Planner, noiseless_raw, relative_rms
+from kcam.units import mm, um, wavelength_grid
+
+
+def camera(*others: optics.Element, diameter: float = 3 * mm, focus: float = 1.5, **arguments) -> Camera:
+    lens = optics.Lens(
+        optics.CircularAperture(diameter),
+        optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"),
+        *others,
+        focus_distance=focus,
+    )
+    return Camera(
+        optics.Imaging(lens, pixel_pitch=4 * um, **arguments),
+        sensor.ColourFilter.kodak(),
+        sensor.Mosaic("RGGB"),
+        sensor.Exposure(),
+        sensor.ShotNoise(full_well=10_000),
+        sensor.ReadNoise(3.0),
+        sensor.ADC(bits=12),
+        isp.Demosaic(),
+        isp.ToneCurve(),
+    )
+
+
+def scene(size: int = 48, *, depth: float | Tensor = 1.0) -> Scene:
+    return Scene.builtin("coffee", (size, size)).with_depth(depth)
+
+
+def ramp(near: float, far: float, size: int = 48) -> Tensor:
+    return torch.linspace(near, far, size, dtype=torch.float64).expand(1, 1, size, size)
+
+
+def choice(plan: Plan, effect: str) -> str:
+    return next(row.chosen for row in plan.decisions if row.effect == effect)
+
+
+# ---- honesty -------------------------------------------------------------------------------------------------------
+
+
+def test_random_pairs_stay_inside_the_tolerance_and_the_estimates_near_the_truth() -> None:
+    """A sample of benchmarks/planner.py, which measures 300 pairs."""
+    ratios = []
+    for seed in (4, 6, 9, 15):
+        shot, light, text, _ = random_pair(seed)
+        with torch.no_grad():
+            planner, truth = Planner(shot, light), noiseless_raw(shot)(light)
+            for tolerance in TOLERANCES[:4]:
+                plan = planner.plan(tolerance)
+                error = plan.measure(shot, light, truth=truth)
+                assert error <= tolerance, f"{text} at {tolerance:g}"
+                assert plan.bound <= tolerance
+                if error > 0:
+                    ratios.append(plan.expected / error)
+    assert 1 / 3 <= statistics.median(ratios) <= 3
+
+
+def test_a_tighter_tolerance_never_has_a_larger_estimate_nor_a_lower_cost() -> None:
+    with torch.no_grad():
+        planner = Planner(camera(), scene(depth=ramp(0.7, 2.0)))
+        plans = [planner.plan(10 ** (-k / 4)) for k in range(2, 16)]
+    for loose, tight in pairwise(plans):
+        assert tight.bound <= loose.bound
+        assert tight.seconds >= 0.999 * loose.seconds
+    assert plans[0].seconds < plans[-1].seconds
+
+
+def test_the_way_up_does_not_depend_on_what_was_planned_before() -> None:
+    with torch.no_grad():
+        shot, light = camera(), scene(depth=ramp(0.7, 2.0))
+        planner = Planner(shot, light)
+        planner.plan(0.002)
+        again, fresh = planner.plan(0.02), shot.plan(light, tolerance=0.02)
+    assert again.changes == fresh.changes
+    assert again.bound == pytest.approx(fresh.bound)
+
+
+def test_tolerance_zero_is_the_reference_physics() -> None:
+    shot, light = camera(), scene(32)
+    plan = shot.plan(light, tolerance=0)
+    assert plan.apply(shot) is shot
+    assert not plan.changes
+    assert plan.bound == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_tolerance_holds_for_a_cube_of_full_rank(dtype: torch.dtype) -> None:
+    values = torch.rand(1, 10, 40, 40, generator=torch.Generator().manual_seed(0)).to(dtype)
+    light = Scene.from_bands(values, wavelengths=wavelength_grid(count=10), depth=1.0)
+    with torch.no_grad():
+        plan = camera().explain(light, tolerance=0.03, measure=True)
+    assert plan.measured["error"] <= 0.03
+    if dtype == torch.float64:
+        assert choice(plan, "precision") == "float32"
+
+
+def test_large_scenes_are_planned_on_crops() -> None:
+    light = Scene.builtin("astronaut", 400)
+    with torch.no_grad():
+        planner = Planner(camera(diameter=1.5 * mm), light)
+        plan = planner.plan(0.03)
+        assert plan.measure(camera(diameter=1.5 * mm), light) <= 0.03
+    assert sum(math.prod(sample.scene.shape[1:]) for sample in planner.trials.samples) < 400 * 400 / 2
+
+
+# ---- what it decides -----------------------------------------------------------------------------------------------
+
+
+def test_a_pinhole_on_large_pixels_needs_no_diffraction() -> None:
+    lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(20 * mm), focus_distance=2.0)
+    shot = Camera(optics.Imaging(lens, pixel_pitch=60 * um), *list(camera())[1:])
+    smooth = Scene.from_rgb(torch.linspace(0.2, 0.8, 32).expand(3, 32, 32), depth=2.0)
+    with torch.no_grad():
+        plan = shot.explain(smooth, tolerance=0.02, measure=True)
+    assert choice(plan, "diffraction") == "none"
+    assert plan.measured["error"] <= 0.02
+    assert "wavelengths" not in {row.effect for row in plan.decisions}
+
+
+def test_nothing_through_which_a_parameter_trains_is_left_out() -> None:
+    lens = optics.Lens(
+        optics.CircularAperture(nn.Parameter(torch.tensor(2 * mm, dtype=torch.float64))),
+        optics.ThinLens(20 * mm),
+        focus_distance=2.0,
+    )
+    read = sensor.ReadNoise(nn.Parameter(torch.tensor(0.1)))
+    stages = [optics.Imaging(lens, pixel_pitch=60 * um), *list(camera())[1:5], read, *list(camera())[6:]]
+    smooth = Scene.from_rgb(torch.linspace(0.2, 0.8, 24).expand(3, 24, 24), depth=2.0)
+    plan = Camera(*stages).plan(smooth, tolerance=0.1)
+    assert choice(plan, "diffraction") != "none"
+    assert "ReadNoise" not in {row.effect for row in plan.decisions}
+    assert 5 not in plan.skipped
+    assert plan.gradients
+
+
+def test_a_step_in_depth_needs_two_layers_and_occlusion_a_plane_neither() -> None:
+    step = torch.where(torch.arange(48) < 24, 0.8, 3.0).double().expand(1, 1, 48, 48)
+    with torch.no_grad():
+        plan = camera().plan(scene(depth=step), tolerance=0.01)
+        flat = camera().plan(scene(), tolerance=0.01)
+    assert choice(plan, "depth") == "2 layers"
+    assert choice(plan, "occlusion") == "over"
+    assert not {"depth", "occlusion"} & {row.effect for row in flat.decisions}
+
+
+def test_noise_is_judged_by_its_sigma_not_by_its_mean() -> None:
+    light = scene(32)
+    with torch.no_grad():
+        loose, tight = (camera().plan(light, tolerance=t) for t in (0.1, 0.001))
+    assert choice(loose, "ShotNoise") == "left out"
+    assert choice(tight, "ShotNoise") == "kept"
+    for plan in (loose, tight):
+        rows = {row.effect: row for row in plan.decisions}
+        assert not rows["ShotNoise"].counted
+        assert rows["ShotNoise"].error > rows["ReadNoise"].error > 0
+    picture = loose.apply(camera())(light)  # without noise two pictures are the same
+    assert torch.equal(picture, loose.apply(camera())(light))
+
+
+def test_the_sensor_sets_the_tolerance_by_the_light_there_is() -> None:
+    bright = scene(40)
+    stages = list(camera())
+    stages[3] = sensor.Exposure(time=1 / 100, iso=100)
+    shot = Camera(*stages)
+    with torch.no_grad():
+        light, dark = (
+            shot.plan(dataclasses.replace(bright, luminance=level), tolerance="sensor") for level in (2e4, 20.0)
+        )
+    assert dark.allowed > 5 * light.allowed
+    assert dark.seconds < light.seconds
+    assert choice(dark, "ShotNoise") == "kept"  # it is what the sensor records
+
+
+def test_a_sensor_without_noise_records_everything() -> None:
+    stages = [stage for stage in camera() if not isinstance(stage, (sensor.ShotNoise, sensor.ReadNoise, sensor.ADC))]
+    with torch.no_grad():
+        plan = Camera(*stages).plan(scene(24), tolerance="sensor")
+    assert plan.allowed == 0
+    assert not plan.changes
+
+
+class Vignetting(nn.Module):
+    """A stage of a user's."""
+
+    def __init__(self, strength: float) -> None:
+        super().__init__()
+        self.strength = strength
+
+    def forward(self, signal: Tensor) -> Tensor:
+        return signal * (1 - self.strength * torch.linspace(-1, 1, signal.shape[-1]) ** 2)
+
+
+class Priced(Vignetting):
+    """One that takes part."""
+
+    def error_if_skipped(self, signal: Tensor, context: kcam.Context) -> float:
+        return relative_rms(signal, self(signal))
+
+    def cost(self, signal: Tensor, context: kcam.Context) -> float:
+        return 2.0
+
+    def reason(self, signal: Tensor, context: kcam.Context) -> str:
+        return f"{self.strength:.0%} at the edge"
+
+
+@pytest.mark.parametrize(("strength", "left_out"), [(0.001, True), (0.5, False)])
+def test_a_stage_of_the_user_s_takes_part_by_three_methods(strength: float, left_out: bool) -> None:
+    stages = list(camera())
+    with torch.no_grad():
+        plan = Camera(*stages[:2], Priced(strength), *stages[2:]).explain(scene(32), tolerance=0.02, measure=True)
+        silent = Camera(*stages[:2], Vignetting(strength), *stages[2:]).plan(scene(32), tolerance=0.02)
+    assert (2 in plan.skipped) == left_out
+    row = next(row for row in plan.decisions if row.effect == "Priced")
+    assert row.counted
+    assert row.why.startswith(f"{strength:.0%}")
+    assert plan.measured["error"] <= 0.02
+    assert 2 not in silent.skipped
+
+
+def test_memory_is_bounded_by_max_memory() -> None:
+    light = scene(64, depth=ramp(0.7, 2.0, 64))
+    with torch.no_grad():
+        plan = camera().plan(light, tolerance=0.01, max_memory=1e6)
+        wide = camera().plan(light, tolerance=0.01)
+    assert plan.changes["max_memory"] == 1e6
+    assert plan.memory < wide.memory
+    with torch.no_grad():
+        assert plan.measure(camera(), light) <= 0.01
+
+
+# ---- the value -----------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_is_saved_loaded_and_applied(tmp_path) -> None:
+    shot, light = camera(), scene(40, depth=ramp(0.7, 2.0, 40))
+    with torch.no_grad():
+        plan = shot.explain(light, tolerance=0.02, measure=True)
+        plan.save(tmp_path / "plan.json")
+        same = kcam.Plan.load(tmp_path / "plan.json")
+        assert same == plan
+        one, two = (p.apply(shot)(light, generator=torch.Generator().manual_seed(1)) for p in (plan, same))
+    assert torch.equal(one, two)
+    json.loads((tmp_path / "plan.json").read_text())
+
+
+def test_an_applied_plan_shares_parameters_and_is_saved_as_a_camera(tmp_path) -> None:
+    curvature = nn.Parameter(torch.tensor(25.8 * mm, dtype=torch.float64))
+    lens = optics.Lens(
+        optics.CircularAperture(2 * mm), optics.PlanoConvexLens(curvature, glass="N-BK7"), focus_distance=1.5
+    )
+    shot = Camera(optics.Imaging(lens, pixel_pitch=4 * um), *list(camera())[1:])
+    light = scene(24)
+    applied = shot.plan(light, tolerance=0.1).apply(shot)
+    assert any(parameter is curvature for parameter in applied.parameters())
+    applied(light).sum().backward()
+    assert curvature.grad is not None
+    applied.save(tmp_path / "planned.safetensors")
+    assert type(Camera.load(tmp_path / "planned.safetensors")) is Camera
+
+
+def test_the_short_form_plans_afresh_and_refuses_to_train() -> None:
+    shot, light = camera(), scene(32)
+    with torch.no_grad():
+        picture = shot(light, tolerance=0.05, generator=torch.Generator().manual_seed(0))
+    assert picture.shape == (1, 3, 32, 32)
+    trained = Camera.thesis()
+    with pytest.raises(ValueError, match=r"tolerance= plans afresh .* plan = camera.plan\(scene, tolerance=...\)"):
+        trained(light, tolerance=0.05)
+
+
+def test_a_scene_out_of_range_warns() -> None:
+    shot = camera()
+    with torch.no_grad():
+        applied = shot.plan(scene(32, depth=1.0), tolerance=0.05).apply(shot)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            applied(scene(32, depth=1.0))
+        for other, text in (
+            (scene(32, depth=0.5), "comes as near as 0.5 m; the nearest planned for was 1 m"),
+            (scene(32, depth=9.0), "goes out to 9 m"),
+            (scene(64), "has 64 x 64 pixels; the plan was for 32 x 32"),
+            (Scene.builtin("star", (32, 32)).with_depth(1.0), "times the contrast"),
+        ):
+            with pytest.warns(OutOfRange, match=text):
+                applied(other)
+        both = shot.plan([scene(32, depth=1.0), scene(32, depth=0.5)], tolerance=0.05)
+        assert both.range.nearest == 2.0
+        assert both.measure(shot, scene(32, depth=0.5)) <= 0.05
+
+
+def test_explain_reads_well_in_100_columns() -> None:
+    with torch.no_grad():
+        plan = camera().explain(scene(40, depth=ramp(0.7, 2.0, 40)), tolerance=0.01, measure=True)
+    text = str(plan)
+    assert max(map(len, text.splitlines())) <= 100
+    for word in ("diffraction", "wavelengths", "depth", "occlusion", "PSF support", "ShotNoise", "Measured: error"):
+        assert word in text
+    share = plan.planning_seconds / plan.reference_seconds
+    assert ("pays for several" in text.replace("\n", " ")) == (share > 0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "text"),
+    [
+        (lambda c, s: c.plan(s, tolerance=-1), ValueError, "tolerance must be a relative error >= 0 such as 0.01"),
+        (lambda c, s: c.plan(s, tolerance=float("nan")), ValueError, "tolerance must be a relative error"),
+        (lambda c, s: c.plan(s, tolerance="eye"), ValueError, 'unknown tolerance "eye": expected a number'),
+        (lambda c, s: c.plan([], tolerance=0.1), ValueError, "there is no scene to plan for"),
+        (lambda c, s: c.plan(s.bands(), tolerance=0.1), TypeError, "a plan is for scenes, got Tensor"),
+        (lambda c, s: c.plan(s, tolerance=0.1, max_memory=0), ValueError, "max_memory must be a positive number"),
+        (lambda c, s: c(s.bands(), tolerance=0.1), TypeError, "tolerance= plans for a Scene, got Tensor"),
+        (lambda c, s: c.plan(s, tolerance=0.1).apply(Camera.ideal()), ValueError, "the plan is for a camera of"),
+        (lambda c, s: Plan.load("nowhere.json"), FileNotFoundError, "there is no file nowhere.json"),
+    ],
+)
+def test_bad_input_says_what_is_wrong(call, error: type[Exception], text: str) -> None:
+    with torch.no_grad(), pytest.raises(error, match=text):
+        call(camera(), scene(16))
+
+
+def test_another_file_is_no_plan(tmp_path) -> None:
+    path = tmp_path / "other.json"
+    path.write_text("[1, 2]")
+    with pytest.raises(ValueError, match="is not a plan that Plan.save wrote"):
+        Plan.load(path)
+
+
+def test_a_camera_without_optics_plans_its_sensor() -> None:
+    with torch.no_grad():
+        plan = Camera.ideal().plan(scene(16), tolerance=0.01)
+    assert "no optics to simplify" in str(plan)
+
+
+# ---- gradients -----------------------------------------------------------------------------------------------------
+
+
+def test_gradients_through_a_plan_are_within_the_tolerance() -> None:
+    phase = nn.Parameter(2 * torch.rand(24, 24, generator=torch.Generator().manual_seed(0)))
+    shot = camera(optics.DOE(phase), diameter=2 * mm)
+    light, tolerance = scene(40), 0.1
+    plan = shot.plan(light, tolerance=tolerance)
+    assert plan.gradients
+    sharp = noiseless_raw(Camera(shot[0].changed(blur=False), *list(shot)[1:]))(light).detach()
+
+    def gradient(shot: Camera) -> Tensor:
+        loss = (noiseless_raw(shot)(light) - sharp).square().mean()
+        return torch.autograd.grad(loss, phase)[0]
+
+    ours, theirs = gradient(plan.apply(shot)), gradient(shot)
+    assert float((ours - theirs).norm() / theirs.norm()) <= tolerance
+    cosine = float((ours * theirs).sum() / ours.norm() / theirs.norm())
+    assert cosine >= 1 - tolerance**2
