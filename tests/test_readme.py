@@ -30,6 +30,7 @@ EXAMPLES = {
     "train_doe": ["--steps", "4", "--out", "doe.png"],
     "compose_camera": ["--size", "40", "--out", "cameras.png"],
     "psf_gallery": ["--pixels", "21", "--out", "gallery.png"],
+    "plan_scenes": ["--size", "40", "--out", "plans"],
 }
 
 

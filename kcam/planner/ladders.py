@@ -164,9 +164,13 @@ def _model(view: _View) -> Iterator[Ladder]:
 
 
 def _sampling(view: _View) -> Iterator[Ladder]:
-    if not view.row.on_grid or view.imaging.samples is not None:
+    """Not under a map of pixels: what a coarse grid makes of it differs from one wavelength to the next, 4 times and
+    more, so that a few would not tell.
+    """
+    imaging = view.imaging
+    if not view.row.on_grid or imaging.samples is not None or imaging.lens.has_pixel_phase:
         return
-    own = view.imaging.kappa or KAPPA
+    own = imaging.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
     yield Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.beside)
 
