@@ -20,6 +20,7 @@ import json
 import math
 import os
 import re
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -33,7 +34,7 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from kcam import Camera, Scene, demo, optics, plots  # noqa: E402
+from kcam import Camera, Plan, Scene, demo, optics, plots  # noqa: E402
 from kcam.optics.propagation import choose  # noqa: E402
 from kcam.optics.psf import Query  # noqa: E402
 from kcam.tradeoff import Row, Sweep  # noqa: E402
@@ -266,6 +267,97 @@ def peers_picture(path: Path) -> None:
     save_plot(sheet.figure, path, source=source)
 
 
+# ---- plans -----------------------------------------------------------------------------------------------------------
+
+PLANS = RESULTS / "plans"
+HONESTY, TRAINING = RESULTS / "planner.json", RESULTS / "planner_training.json"
+
+
+def plans_table() -> str:
+    """What examples/plan_scenes.py printed of its plans, and what changes between bright and dim light."""
+    plans = {path.stem: Plan.load(path) for path in sorted(PLANS.glob("*.json"))}
+    parts = [f"{title}\n\n```text\n{plans[name]}\n```" for name, title in PLAN_TITLES.items()]
+    effects = list(dict.fromkeys(row.effect for name in ("bright", "dim") for row in plans[name].decisions))
+    chosen = [{row.effect: row.chosen for row in plans[name].decisions} for name in ("bright", "dim")]
+    lines = ['| `tolerance="sensor"` | bright, 1200 cd/m² | dim, 10 cd/m² |', "|---|---|---|"]
+    lines.append(f"| allowed error | {' | '.join(scientific(plans[name].allowed) for name in ('bright', 'dim'))} |")
+    for effect in effects:
+        if effect not in ("memory", "saturation"):
+            lines.append(f"| {effect} | {' | '.join(choices.get(effect, '') for choices in chosen)} |")
+    measured = [plans[name].measured for name in ("bright", "dim")]
+    lines.append(f"| true error | {' | '.join(scientific(found['error']) for found in measured)} |")
+    gains = [found["reference_seconds"] / found["seconds"] for found in measured]
+    lines.append(f"| times as fast | {' | '.join(figures(gain) for gain in gains)} |")
+    return "\n\n".join([*parts, "\n".join(lines)])
+
+
+PLAN_TITLES = {
+    "wall": "**A flat wall at 5 m**, the distance of focus:",
+    "night": "**A street at night**, houses from 2.5 m and lamps far away, through the same camera:",
+}
+
+
+def honesty_table() -> str:
+    """Random pairs of camera and scene: inside the tolerance or not, the estimate, and how much faster."""
+    content = json.loads(HONESTY.read_text())
+    lines = [
+        "| tolerance | inside | largest error | estimate / truth | times as fast, quartiles | predicted / measured |",
+        "|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in content["summary"]:
+        low, high = row["speed_up_quartiles"]
+        inside = f"{row['inside']} of {row['pairs']}"
+        lines.append(
+            f"| {row['tolerance']:g} | {inside if row['inside'] == row['pairs'] else f'**{inside}**'} | "
+            f"{row['worst']:.2f} of it | {figures(row['estimate_over_truth'])} | **{figures(row['speed_up'])}**, "
+            f"{figures(low)} to {figures(high)} | {figures(row['predicted_over_measured'])} |"
+        )
+    failures = content["failures"]
+    outside = "; ".join(f"{f['pair']}: {scientific(f['error'])} at {f['tolerance']:g}" for f in failures)
+    lines += [
+        "",
+        f"{len(content['pairs'])} pairs, {content['drawn_again']} drawn again because their reference would have taken "
+        f"over a minute. Outside: {outside or 'none'}. Making the first plan of a pair took "
+        f"{figures(content['summary'][0]['planning_share'])} times the reference's time in the median.",
+    ]
+    return "\n".join(lines)
+
+
+def training_table() -> str:
+    """The same DOE trained with a plan and without."""
+    content = json.loads(TRAINING.read_text())
+    lines = ["| 100 steps of Adam | time | loss, first to last |", "|---|---:|---:|"]
+    for name, key in (("through the plan", "with_plan"), ("everything simulated", "without")):
+        run = content[key]
+        losses = f"{scientific(run['first_loss'])} to {scientific(run['final_loss'])}"
+        lines.append(f"| {name} | {figures(run['seconds'])} s | {losses} |")
+    lines += [
+        "",
+        "| after steps | raw error of the plan | gradient: cosine | norm | relative error |",
+        "|---:|---:|---:|---:|---:|",
+    ]
+    for check in content["with_plan"]["checks"]:
+        lines.append(
+            f"| {check['step']} | {scientific(check['raw_error'])} | {check['gradient_cosine']:.4f} | "
+            f"{check['gradient_norm_ratio']:.3f} | {scientific(check['gradient_error'])} |"
+        )
+    return "\n".join(lines)
+
+
+def plans_picture(path: Path) -> None:
+    """One scene at three tolerances: what examples/plan_scenes.py draws; its plans become the results."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    import plan_scenes
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        plan_scenes.main(["--out", folder])
+        PLANS.mkdir(exist_ok=True)
+        for source in sorted(Path(folder).glob("*.json")):
+            shutil.copy(source, PLANS / source.name)
+        for name, target in (("tolerances", path), ("scenes", path.with_name("plans-scenes.jpg"))):
+            Image.open(Path(folder) / f"{name}.png").convert("RGB").save(target, quality=88, optimize=True)
+
+
 # ---- the benchmarks --------------------------------------------------------------------------------------------------
 
 
@@ -351,6 +443,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "propagators": propagators_table,
     "tradeoff": tradeoff_table,
     "traps": traps_table,
+    "plans": plans_table,
+    "honesty": honesty_table,
+    "training": training_table,
     "benchmarks": benchmarks_table,
 }
 
@@ -498,6 +593,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "tradeoff-singlet.png": tradeoff_picture,
     "tradeoff-thesis.png": tradeoff_picture,
     "peers.png": peers_picture,
+    "plans.jpg": plans_picture,
 }
 
 

@@ -121,6 +121,48 @@ def test_seed_decides_the_noise(photo: Path, tmp_path: Path) -> None:
     assert one.read_bytes() != two.read_bytes()
 
 
+def test_shoot_within_a_tolerance(photo: Path, tmp_path: Path) -> None:
+    """Planned and whole picture differ, but by less than one sees."""
+    whole, planned = tmp_path / "1.png", tmp_path / "2.png"
+    run("shoot", photo, "--camera", "thesis", "--out", whole)
+    run("shoot", photo, "--camera", "thesis", "--tolerance", "0.01", "--out", planned)
+    one, two = (np.asarray(Image.open(path)).astype(float) for path in (whole, planned))
+    assert 0 < np.abs(one - two).max() < 12
+    assert "is no relative error: expected e.g. 0.01, or sensor" in fails("shoot", photo, "--tolerance", "fine")
+    assert "must be a relative error >= 0" in fails("shoot", photo, "--tolerance", "-1")
+
+
+def test_explain(photo: Path, tmp_path: Path) -> None:
+    out = tmp_path / "plan.json"
+    text = run("explain", photo, "--camera", "phone", "--tolerance", "0.05", "--measure", "--out", out)
+    assert text.startswith("Plan for 40 x 56 pixels, 28 bands, 2 m; tolerance 0.05")
+    assert "Measured: error" in text
+    plan = kcam.Plan.load(out)
+    assert plan.measured["error"] <= 0.05
+    assert "2.1" in run("explain", "motorcycle", "--size", 32, "--tolerance", "sensor").splitlines()[0]
+    assert "there is no file" in fails("explain", tmp_path / "nothing.png")
+    assert "unknown camera" in fails("explain", photo, "--camera", "pinhole")
+
+
+@pytest.mark.slow
+def test_calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rates are positive, kept, and used; a damaged file counts as none."""
+    from kcam.planner import costs
+
+    monkeypatch.setenv("KCAM_CACHE", str(tmp_path))
+    assert costs.current_rates() == costs.RATES
+    text = run("calibrate")
+    assert str(tmp_path / "rates.json") in text
+    found = re.search(r"factor of ([\d.]+)", text)
+    assert found is not None
+    assert float(found[1]) >= 1
+    rates = costs.current_rates()
+    assert rates != costs.RATES
+    assert all(rate > 0 for rate in rates.values())
+    (tmp_path / "rates.json").write_text("damaged")
+    assert costs.current_rates() == costs.RATES
+
+
 def test_shoot_bad_input(photo: Path, tmp_path: Path) -> None:
     out = tmp_path / "shot.png"
     text = tmp_path / "text.jpg"

@@ -156,9 +156,7 @@ class Imaging(Stage):
         if self.rank is not None and self.rank < scene.coefficients.shape[1]:
             scene = scene.low_rank(self.rank)
         planes = scene.coefficients
-        working = planes if planes.dtype in (torch.float32, torch.float64) else planes.float()
-        if self.precision is not None:
-            working = planes.to(getattr(torch, self.precision))
+        working = self._working(planes)
         contraction = None if colour_filter is None else colour_filter.contraction(scene.wavelengths)
         with full_precision(working.device):
             result = self._render(scene, working, contraction).to(planes.dtype)
@@ -302,6 +300,12 @@ class Imaging(Stage):
         layers = torch.arange(vergences.numel(), device=depth.device, dtype=torch.float64)
         return torch.clamp(1 - (position - layers[:, None, None]).abs(), min=0)
 
+    def _working(self, planes: Tensor) -> Tensor:
+        """In the type that is computed in: at least float32."""
+        if self.precision is not None:
+            return planes.to(getattr(torch, self.precision))
+        return planes if planes.dtype in (torch.float32, torch.float64) else planes.float()
+
     def _layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vergences of the layers in which there is anything, and the share of each pixel in them; None for one."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
@@ -318,9 +322,7 @@ class Imaging(Stage):
 
     def work(self, scene: Scene, *, channels: int | None = None) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
-        planes = scene.coefficients
-        if self.precision is not None:
-            planes = planes.to(getattr(torch, self.precision))
+        planes = self._working(scene.coefficients)
         batch, count, height, width = planes.shape
         bands, factored = scene.wavelengths.numel(), scene.spectra is not None
         low_rank = self.rank is not None and self.rank < count

@@ -120,7 +120,7 @@ class _View:
 
     def __init__(self, trials: Trials, imaging: Imaging, scene: Scene) -> None:
         self.imaging, self.scene = imaging, scene
-        planes = scene.coefficients
+        planes = imaging._working(scene.coefficients)
         self.vergences, _ = imaging._layers_of(scene, planes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         self.layers = len(imaging.depth_layers(depth, scene.wavelengths)) if depth.numel() else 1

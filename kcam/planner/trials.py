@@ -67,7 +67,7 @@ class Trials:
         self.imaging: Imaging | None = None if self.index is None else stages[self.index]
         self.parameters = [p for p in self.raw_camera.parameters() if p.requires_grad]
         self.gradients = torch.is_grad_enabled() and bool(self.parameters)
-        items = [item for scene in scenes for item in _items(scene)]
+        items = [item for scene in scenes for item in _items(scene) if item.coefficients.numel()]
         self.samples = [sample for origin, item in enumerate(items) for sample in _samples(item, origin)]
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
 
@@ -139,13 +139,12 @@ class Trials:
                 camera = self._with(sample, settings)
                 context = self.camera.resolve(sample.scene)
                 given: dict[int, tuple[Tensor, Context]] = {}
-                index, signal = -1, sample.scene.bands() if self.imaging is None else torch.empty(0)
-                for name, after in camera.steps(sample.scene):
-                    index += 1 + name.count(" + ")
-                    signal = after
-                    given[index + 1] = (signal, context)
-                if 0 not in given and self.index != 0:
+                if self.index != 0:
                     given[0] = (sample.scene.bands(), context)
+                index = 0
+                for name, signal in camera.steps(sample.scene):
+                    index += 1 + name.count(" + ")  # an Imaging that absorbs its filter is one step
+                    given[index] = (signal, context)
                 result.append(given)
         return result
 
@@ -185,7 +184,7 @@ def _items(scene: Scene) -> list[Scene]:
 
 def _samples(scene: Scene, origin: int) -> list[Sample]:
     """A small scene whole; of a large one, crops: the most detailed of each of some strata of detail."""
-    if scene.shape[1] * scene.shape[2] <= LARGEST or not scene.coefficients.numel():
+    if scene.shape[1] * scene.shape[2] <= LARGEST:
         return [Sample(scene, origin)]
     return _crops(scene, origin)
 

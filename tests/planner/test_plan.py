@@ -7,6 +7,7 @@ import json
 import math
 import statistics
 import warnings
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -118,6 +119,31 @@ def test_large_scenes_are_planned_on_crops() -> None:
         plan = planner.plan(0.03)
         assert plan.measure(camera(diameter=1.5 * mm), light) <= 0.03
     assert sum(math.prod(sample.scene.shape[1:]) for sample in planner.trials.samples) < 400 * 400 / 2
+
+
+HARD: dict[str, Callable[[], Scene]] = {
+    "black": lambda: Scene.from_bands(torch.zeros(1, 28, 16, 16), depth=2.0),
+    "empty": lambda: Scene.from_bands(torch.zeros(0, 28, 16, 16), depth=2.0),
+    "one pixel": lambda: Scene.from_bands(torch.ones(1, 28, 1, 1), depth=2.0),
+    "one row": lambda: Scene.from_bands(torch.rand(1, 28, 1, 57), depth=2.0),
+    "one band": lambda: Scene.from_bands(torch.rand(1, 1, 16, 20), wavelengths=[550e-9], depth=2.0),
+    "at infinity": lambda: Scene.from_rgb(torch.rand(1, 3, 16, 20), depth=math.inf),
+    "half": lambda: Scene.from_rgb(torch.rand(1, 3, 16, 20), depth=1.0).to(dtype=torch.float16),
+    "batch": lambda: Scene.from_rgb(torch.rand(6, 3, 16, 20), depth=1.0),
+    "batch of maps": lambda: Scene.from_rgb(torch.rand(3, 3, 16, 20), depth=torch.rand(3, 1, 16, 20) + 1),
+    "saturated": lambda: Scene.from_rgb(torch.ones(1, 3, 16, 20), depth=1.2),
+}
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_hard_scenes_are_planned_too(case: str) -> None:
+    torch.manual_seed(0)
+    light, shot, tolerance = HARD[case](), camera(), 0.05
+    with torch.no_grad():
+        plan = shot.plan(light, tolerance=tolerance)
+        assert plan.measure(shot, light) <= tolerance
+        assert plan.apply(shot)(light).isfinite().all()
+    assert str(plan)
 
 
 # ---- what it decides -----------------------------------------------------------------------------------------------
