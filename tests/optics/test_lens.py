@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from kcam import optics
+from kcam.optics.propagation import choose
 from kcam.units import mm, nm, um
 
 WAVELENGTH = 550 * nm
@@ -213,6 +214,7 @@ QUERIES = [
     ({"method": "nufft"}, r"nonparaxial has no method 'nufft'; known: matrix, chirp_z, fft, radial"),
     ({"propagator": "geometric", "method": "fft"}, r"geometric has no method 'fft'; known: rays"),
     ({"samples": 16}, r"samples must be an integer >= 32 .* got 16"),
+    ({"samples": 10**6}, r"samples 1000000 across the pupil is above the limit of 8192. Leave samples out"),
     ({"samples": 64.0}, r"samples must be an integer >= 32 .* got 64.0"),
     ({"fill_factor": 0.0}, r"fill_factor 0 must be in \(0, 1\]"),
     ({"fill_factor": 1.5}, r"fill_factor 1.5 must be in \(0, 1\]"),
@@ -224,6 +226,13 @@ QUERIES = [
 def test_bad_queries_say_what_is_wrong(change: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         thin_lens().psf(**(PSF | change))
+
+
+def test_counts_may_be_numpys() -> None:
+    lens, plain = thin_lens(), PSF | {"shape": (33, 31), "samples": 64}
+    numpys = plain | {"shape": (np.int64(33), np.int32(31)), "samples": np.int64(64)}
+    for ask in (lens.psf, lens.mtf, lens.encircled_energy):
+        torch.testing.assert_close(ask(**numpys), ask(**plain), rtol=0, atol=0)
 
 
 def test_glass_and_wavelength_must_fit() -> None:
@@ -242,8 +251,19 @@ def test_a_pupil_too_coarse_for_the_window_is_an_error_that_names_the_sampling()
 
 def test_a_blur_beyond_all_sampling_is_an_error() -> None:
     lens = optics.Lens(optics.CircularAperture(20 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
-    with pytest.raises(ValueError, match=r"needs \d+ pupil samples at 550 nm .* more than 16384. Use a smaller shape"):
+    with pytest.raises(ValueError, match=r"needs \d+ pupil samples at 550 nm .* the limit of 8192. Use a smaller"):
         lens.psf(**(PSF | {"distances": 0.02}), method="matrix")
+
+
+def test_an_fft_that_would_take_too_many_samples_leaves_it_to_others() -> None:
+    """Bins that fall on the points ask for twice the samples, each of 320 bytes."""
+    aberration = torch.zeros(11)
+    aberration[10] = 1e-6
+    lens = optics.Lens(ROUND, optics.ThinLens(50 * mm), optics.ZernikeAberration(aberration), focus_distance=2.0)
+    query = PSF | {"pixel_pitch": 6 * um, "shape": (4001, 4001)}
+    with pytest.raises(ValueError, match=r"nonparaxial/fft needs \d+ pupil samples .* the limit of 8192; use method="):
+        lens.psf(**query, method="fft")
+    assert choose(lens.query(**query)).method == "chirp_z"
 
 
 def test_a_curvature_trained_into_the_aperture_is_an_error() -> None:
