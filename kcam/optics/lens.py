@@ -17,7 +17,7 @@ from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
 from kcam.optics.sampling import MAX_PUPIL_SAMPLES
-from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
+from kcam.units import check_distances, check_pixel_pitch, check_positive, check_trained, wavelength_grid
 
 TESTED_F_NUMBERS = (1.8, 100.0)
 """Within these the non-paraxial PSF is held to Rayleigh-Sommerfeld, on the axis and within 1e-2.
@@ -251,8 +251,10 @@ class Lens(nn.Module):
         if device is None:
             device = next((t.device for t in (*self.parameters(), *self.buffers())), torch.device("cpu"))
         grid = check_distances(distances).to(device)
-        if grid.ndim > 1:
-            raise ValueError(f"distances must be a number or a vector (Z,), got shape {tuple(grid.shape)}.")
+        if grid.ndim > 1 or grid.numel() == 0:
+            raise ValueError(
+                f"distances must be a number or a vector (Z,) with Z >= 1, got shape {tuple(grid.shape)}. Use [2.0]."
+            )
         self._check_trained()
         self._check_curvature()
         self._check_f_number()
@@ -412,12 +414,9 @@ class Lens(nn.Module):
     def _check_trained(self) -> None:
         """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
         for name, value in (*self.named_parameters(), *self.named_buffers()):
-            bad = int((~torch.isfinite(value.detach())).sum())
-            if bad:
-                raise ValueError(
-                    f"{name} of the lens has {bad} values that are NaN or infinite; expected finite ones everywhere. "
-                    "Load values from before they were lost, and train with a smaller step."
-                )
+            check_trained(value, name=f"{name} of the lens")
+        for element in self.elements:
+            element.check()
         check_positive(self.sensor_distance, name="sensor_distance")
         check_positive(self.aperture.semi_aperture(), name="semi-aperture")
 
@@ -447,7 +446,7 @@ class Lens(nn.Module):
 
 
 def _is_count(value: object) -> bool:
-    return isinstance(value, Integral) and value >= 1
+    return isinstance(value, Integral) and int(value) >= 1
 
 
 def _points_per_pixel(query: Query, wavelength: Tensor) -> int:
