@@ -241,7 +241,7 @@ def duration(seconds: float) -> str:
 
 
 SHARE_SHOWN = 0.97
-"""Of the light of each PSF in its window: what the panels of a PSF figure hold at least."""
+"""Of the light of each PSF in its window of 255 pixels: what the panels of a PSF figure hold of it at least."""
 
 CURVE_COLOURS = ("#c8553d", "#1c1c22", "#2a9d8f", "#3f6fd8", "#8f5fbf", "#b8860b")
 
@@ -278,6 +278,9 @@ def psf_figure(
     reach = _reach(psf, share=SHARE_SHOWN)
     window = {"shape": (2 * reach + 1, 2 * reach + 1)}
     daylight = lens.psf(bands, fill_factor=imaging.fill_factor, **(arguments | window)).detach().double().cpu()
+    luminance = spectral.xyz_weights(bands, "D65")[:, 1]
+    shares = [_centre(psf, reach).sum((-2, -1)), daylight.sum((-2, -1)) @ luminance / luminance.sum()]
+    least = min(float(share.min()) for share in shares)
     daylight = torch.einsum("dlhw,lc->dchw", daylight, spectral.xyz_weights(bands, "D65"))
     daylight = spectral.xyz_to_linear_srgb(daylight).clamp(min=0)
     lit = [light_colours(colours_at)[index] for index in range(len(colours_at))]
@@ -299,7 +302,7 @@ def psf_figure(
         0.64,
         f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, in focus at {metres(focus)};  "
         f"pixels of {pitch / um:.3g} \u00b5m\n"
-        f"Panels: the middle {2 * reach + 1} of {min(shape)} pixels, with {SHARE_SHOWN:.0%} or more of their light; "
+        f"Panels: the middle {2 * reach + 1} of {min(shape)} pixels, with {percent_or_more(least)} of their light; "
         "each scaled to its own peak, square root shown",
         colour=MUTED,
         linespacing=1.4,
@@ -391,6 +394,11 @@ def _reach(psf: Tensor, *, share: float) -> int:
 def _centre(psf: Tensor, reach: int) -> Tensor:
     row, column = (size // 2 for size in psf.shape[-2:])
     return psf[..., row - reach : row + reach + 1, column - reach : column + reach + 1]
+
+
+def percent_or_more(share: float) -> str:
+    """A share that is not less than the text says: "97% or more", "less than 1%"."""
+    return f"{math.floor(100 * min(share, 1.0))}% or more" if share >= 0.01 else "less than 1%"
 
 
 def metres(distance: float) -> str:

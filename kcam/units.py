@@ -19,6 +19,7 @@ is turned by 180 degrees.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,6 +31,9 @@ cm = 1e-2
 
 WAVELENGTH_RANGE = (1e-7, 2e-5)
 PIXEL_PITCH_RANGE = (1e-7, 1e-3)
+DOE_PITCH_RANGE = (1e-8, 5e-2)
+LEAST_DISTANCE = 1e-7
+"""Of an object, and of a focal length [m]: the shortest wavelength; far below, powers of 1 / distance overflow."""
 
 
 def wavelength_grid(wavelengths: Tensor | list[float] | None = None, *, count: int = 28) -> Tensor:
@@ -37,11 +41,12 @@ def wavelength_grid(wavelengths: Tensor | list[float] | None = None, *, count: i
 
     Args:      wavelengths: (L,) [m], in any order; None for the default grid.
     Returns:   (L,) float64 [m].
-    Raises:    ValueError for an empty or nested list, or a value outside 1e-7..2e-5 m.
+    Raises:    ValueError for an empty or nested list, or a value outside 1e-7..2e-5 m; TypeError for what is no number.
     """
     if wavelengths is None:
         return torch.linspace(420, 720, count, dtype=torch.float64) * nm
-    grid = torch.as_tensor(wavelengths, dtype=torch.float64).detach().cpu()
+    expected = "numbers of metres such as [450 * nm, 550 * nm]"
+    grid = as_numbers(wavelengths, name="wavelengths", expected=expected).detach().cpu()
     if grid.ndim == 0:
         grid = grid[None]
     if grid.ndim != 1 or grid.numel() == 0:
@@ -49,39 +54,81 @@ def wavelength_grid(wavelengths: Tensor | list[float] | None = None, *, count: i
     low, high = WAVELENGTH_RANGE
     for value in grid.tolist():
         if not low <= value <= high:
-            scale = "nm" if 100 <= value <= 20_000 else "um"
+            unit = "nm" if 100 <= value <= 20_000 else "um"
             raise ValueError(
-                f"wavelength {value:g} is outside {low:g}..{high:g} m. Wavelengths are in metres; "
-                f"did you mean {value:g} * {scale}?"
+                f"wavelength {value:g} is outside {low:g}..{high:g} m. Wavelengths are in metres"
+                f"{_perhaps(value, unit, example='550 * nm')}"
             )
     return grid
 
 
-def check_pixel_pitch(pitch: float) -> float:
-    """A pixel pitch in metres, 0.1 um to 1 mm; ValueError that names the likely mistake otherwise."""
-    low, high = PIXEL_PITCH_RANGE
-    if not low <= float(pitch) <= high:
+def as_numbers(value: Any, *, name: str, expected: str) -> Tensor:
+    """A number, a list or a tensor as float64; TypeError that says what was expected for anything else."""
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        fix = " Write a number, not text." if isinstance(value, str) else ""
+        raise TypeError(f"{name} must be {expected}, got {value!r}.{fix}") from error
+
+
+def _perhaps(value: float, unit: str, *, example: str) -> str:
+    """What a length of the wrong scale was probably meant to be; an example where it can be nothing."""
+    return f"; did you mean {value:g} * {unit}?" if 0 < value < math.inf else f", such as {example}."
+
+
+def check_length(value: Tensor | float, *, name: str, within: tuple[float, float], example: str) -> float:
+    """A length in metres; ValueError that names the likely mistake outside a range, TypeError for what is no number."""
+    expected = f"a number of metres such as {example}"
+    number = as_numbers(value, name=name, expected=expected).detach()
+    if number.numel() != 1:
+        raise TypeError(f"{name} must be {expected}, got {number.numel()} of them.")
+    metres, (low, high) = number.item(), within
+    if not low <= metres <= high:
         raise ValueError(
-            f"pixel_pitch {float(pitch):g} is outside {low:g}..{high:g} m. Lengths are in metres; "
-            f"did you mean {float(pitch):g} * {'nm' if float(pitch) >= 100 else 'um'}?"
+            f"{name} {metres:g} is outside {low:g}..{high:g} m. Lengths are in metres"
+            f"{_perhaps(metres, 'nm' if metres >= 100 else 'um', example=example)}"
         )
-    return float(pitch)
+    return metres
+
+
+def check_pixel_pitch(pitch: float) -> float:
+    """A pixel pitch in metres, 0.1 um to 1 mm; errors as `check_length`."""
+    return check_length(pitch, name="pixel_pitch", within=PIXEL_PITCH_RANGE, example="4 * um")
 
 
 def check_distances(distance: Tensor | float, *, name: str = "distance") -> Tensor:
-    """Object distances in metres as float64, each > 0 or inf; ValueError for zero, negative or NaN."""
-    values = torch.as_tensor(distance, dtype=torch.float64)
+    """Object distances in metres as float64, each > 0 or inf.
+
+    Raises:    ValueError for zero, negative, NaN, or nearer than 1e-7 m; TypeError for what is no number.
+    """
+    values = as_numbers(distance, name=name, expected="a number of metres such as 2.0")
     bad = ~(values > 0)
     if bad.any():
         raise ValueError(
             f"{name} {values[bad].flatten()[0].item():g} is not a distance in front of the lens: expected metres > 0, "
             "or float('inf') for infinity."
         )
+    near = values < LEAST_DISTANCE
+    if near.any():
+        raise ValueError(
+            f"{name} {values[near].flatten()[0].item():g} is too near: expected metres >= {LEAST_DISTANCE:g}, such as "
+            "2.0."
+        )
     return values
 
 
+def check_trained(value: Tensor, *, name: str) -> None:
+    """ValueError where an optimiser's step or a loaded file brought NaN or infinity in."""
+    bad = int((~torch.isfinite(value.detach())).sum())
+    if bad:
+        raise ValueError(
+            f"{name} has {bad} values that are NaN or infinite; expected finite ones everywhere. Load values from "
+            "before they were lost, and train with a smaller step."
+        )
+
+
 def check_positive(value: Tensor | float, *, name: str, unit: str = "m") -> None:
-    """ValueError unless every element of `value` is finite and > 0."""
-    number = float(torch.as_tensor(value).detach().min()) if torch.is_tensor(value) else float(value)
+    """ValueError unless every element of `value` is finite and > 0; TypeError for what is no number."""
+    number = float(as_numbers(value, name=name, expected=f"a number > 0 {unit}").detach().min())
     if not (number > 0 and math.isfinite(number)):
         raise ValueError(f"{name} must be finite and > 0 {unit}, got {number:g}.")

@@ -11,7 +11,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from torch import Tensor, nn
 
 import kcam
-from kcam import Camera, Context, Scene, Stage, isp, optics, sensor
+from kcam import Camera, Context, Scene, Stage, demo, isp, optics, sensor
 from kcam.camera import PRESETS
 from kcam.units import mm, nm, um
 
@@ -374,3 +374,11 @@ def test_other_wavelengths() -> None:
     wavelengths = torch.tensor([450.0, 530.0, 610.0]) * nm
     scene = Scene.from_bands(torch.rand(1, 3, 16, 16, generator=seeded()), wavelengths=wavelengths)
     assert full_camera()(scene).shape == (1, 3, 16, 16)
+
+
+@pytest.mark.parametrize(("size", "percent"), [(64, 0.8), (128, 0.4)])
+def test_white_is_dark_by_the_light_outside_a_small_picture(size: int, percent: float) -> None:
+    """A PSF is no wider than the picture: the README's numbers, mean over bands and pixels."""
+    white = Scene.from_rgb(torch.ones(3, size, size), depth=2.0)
+    loss = 1 - demo.singlet()[0](white).mean() / white.bands().mean()
+    assert 100 * float(loss) == pytest.approx(percent, abs=0.05)

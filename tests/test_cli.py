@@ -243,6 +243,36 @@ def test_psf_bad_input(tmp_path: Path) -> None:
     assert "with commas" in fails("psf", "--out", tmp_path / "psf.png", "--distances", "1;2")
 
 
+def shown(distances: list[float]) -> tuple[int, int, str]:
+    """(side of the panels, least share in percent, the whole caption) of the phone's figure at 550 nm."""
+    figure = plots.psf_figure(Camera.phone()[0], distances=distances, wavelengths=[550 * nm], title="phone")
+    caption = next(text.get_text() for text in figure.texts if "Panels" in text.get_text())
+    found = re.search(r"the middle (\d+) of 255 pixels, with (?:(\d+)% or more|less than 1%) of their light", caption)
+    assert found, caption
+    return int(found[1]), int(found[2] or 0), caption
+
+
+def test_a_psf_figure_states_the_share_of_light_that_it_shows() -> None:
+    near = [0.01, 0.1]
+    side, percent, _ = shown(near)
+    phone = Camera.phone()[0]
+    energy = phone.lens.psf(
+        [550 * nm], distances=near, pixel_pitch=phone.pixel_pitch, shape=(side, side), fill_factor=phone.fill_factor
+    ).sum((-2, -1))
+    # at 1 cm the blur is a disc far wider than the panel: 12 % of it, where the caption said 97 %
+    assert 0.05 < energy.min() < 0.2
+    # daylight has less within at its long wavelengths, by 3 % of the light here at most
+    assert energy.min() - 0.04 < percent / 100 <= energy.min()
+    assert shown([2.0])[1] >= 90
+    assert "less than 1% of their light" in shown([0.002])[2]
+
+
+def test_a_share_is_never_rounded_up() -> None:
+    assert plots.percent_or_more(0.979) == "97% or more"
+    assert plots.percent_or_more(1.0000001) == "100% or more"
+    assert plots.percent_or_more(0.004) == "less than 1%"
+
+
 def test_help_names_the_units() -> None:
     """Typer reads [nm] as markup, and drops it."""
     text = unboxed(run("psf", "--help"))

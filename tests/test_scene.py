@@ -271,6 +271,8 @@ class TestScene:
             Scene(planes, torch.ones(3, 2), torch.tensor([420.0, 720.0]))
         with pytest.raises(ValueError, match="luminance must be finite and > 0 cd/m\\^2, got 0"):
             Scene(planes, spectra, luminance=0.0)
+        with pytest.raises(TypeError, match="luminance must be a number > 0 cd/m\\^2, got 'bright'. Write a number"):
+            Scene(planes, spectra, luminance="bright")
         with pytest.raises(ValueError, match="unknown illuminant 'sun'"):
             Scene(planes, spectra, illuminant="sun")
 

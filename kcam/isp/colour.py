@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import torch
 from kornia.color import linear_rgb_to_rgb
@@ -13,6 +14,7 @@ from kcam.context import Context, Stage
 from kcam.sensor.colour_filter import ColourFilter
 from kcam.sensor.noise import hold, in_float32, like
 from kcam.ste import clip_ste
+from kcam.units import as_numbers
 
 LEAST_WHITE = 1e-6
 NOISE = 0.003
@@ -72,18 +74,30 @@ def white_balance(signal: Tensor, *, gains: Tensor) -> Tensor:
     return signal * gains.to(signal)[:, None, None]
 
 
+def gains_of(gains: Tensor | Sequence[float] | None) -> Tensor | None:
+    """White balance gains as a tensor (C,), a Parameter as it is; TypeError, ValueError for what can be none."""
+    if gains is None:
+        return None
+    expected = "one number per channel such as [1.6, 1.0, 1.2]"
+    values = gains if isinstance(gains, Tensor) else as_numbers(gains, name="gains", expected=expected)
+    if values.ndim != 1 or values.numel() == 0:
+        raise ValueError(f"gains must be {expected}, (C,), got shape {tuple(values.shape)}.")
+    return values
+
+
 class WhiteBalance(Stage):
     """White balance: one gain per channel, `white_balance`.
 
-    Args:      gains: (C,); an nn.Parameter trains. None for `as_shot_gains`: the light of the scene, as the colour
-               filter sees it.
+    Args:      gains: (C,), a tensor or a sequence; an nn.Parameter trains. None for `as_shot_gains`: the light of the
+               scene, as the colour filter sees it.
+    Raises:    TypeError, ValueError for gains that are not one number per channel.
     """
 
     gains: Tensor | None
 
-    def __init__(self, gains: Tensor | None = None):
+    def __init__(self, gains: Tensor | Sequence[float] | None = None):
         super().__init__()
-        hold(self, gains=gains)
+        hold(self, gains=gains_of(gains))
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) to the same shape."""
@@ -159,14 +173,20 @@ def apply_colour_matrix(signal: Tensor, *, matrix: Tensor) -> Tensor:
 class ColourMatrix(Stage):
     """Camera colours to linear sRGB, a perfect white to 1.0: `apply_colour_matrix`.
 
-    Args:      matrix: (3,C); an nn.Parameter trains. None for `as_shot_colour_matrix`, fitted for the context's filter
-               and light. It counts on a white balanced signal. A signal of one channel becomes gray.
+    Args:      matrix: (3,C), a tensor or rows; an nn.Parameter trains. None for `as_shot_colour_matrix`, fitted for the
+               context's filter and light. It counts on a white balanced signal. A signal of one channel becomes gray.
+    Raises:    TypeError, ValueError for a matrix that has not three rows.
     """
 
     matrix: Tensor | None
 
-    def __init__(self, matrix: Tensor | None = None):
+    def __init__(self, matrix: Tensor | Sequence[Sequence[float]] | None = None):
         super().__init__()
+        if matrix is not None:
+            expected = "three rows of one number per channel such as torch.eye(3)"
+            matrix = matrix if isinstance(matrix, Tensor) else as_numbers(matrix, name="matrix", expected=expected)
+            if matrix.ndim != 2 or matrix.shape[0] != 3 or matrix.shape[1] == 0:
+                raise ValueError(f"matrix must be {expected}, (3, C), got shape {tuple(matrix.shape)}.")
         hold(self, matrix=matrix)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:

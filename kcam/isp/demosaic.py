@@ -7,7 +7,7 @@ height and width. They run in the domain, and after the balancing, that measured
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
-from kcam.isp.colour import as_shot_gains
+from kcam.isp.colour import as_shot_gains, gains_of
 from kcam.sensor.mosaic import PATTERNS, pattern_tile
 from kcam.sensor.noise import hold, in_float32, like
 
@@ -448,14 +448,14 @@ class Demosaic(Stage):
         *,
         domain: str = "sqrt",
         pattern: str | None = None,
-        gains: Tensor | None = None,
+        gains: Tensor | Sequence[float] | None = None,
     ):
         super().__init__()
         _check_domain(domain)
         _check_method(method)
         if pattern is not None:
             _row(method, pattern)
-        hold(self, method=method, domain=domain, pattern=pattern, gains=gains)
+        hold(self, method=method, domain=domain, pattern=pattern, gains=gains_of(gains))
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,1,H,W) to (B,C,H,W)."""

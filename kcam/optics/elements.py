@@ -17,7 +17,7 @@ from kcam.context import arguments_text
 from kcam.optics.materials import refractive_index
 from kcam.optics.pupil import Pupil
 from kcam.ste import round_ste
-from kcam.units import check_positive, wavelength_grid
+from kcam.units import DOE_PITCH_RANGE, LEAST_DISTANCE, as_numbers, check_length, check_positive, wavelength_grid
 
 Term = tuple[Tensor, Tensor]  # coefficients (L,), map over the pupil [the product is an OPD in metres]
 Scalar = float | Tensor
@@ -82,6 +82,9 @@ class Element(nn.Module):
     def pixel_map(self, wavelengths: Tensor) -> PixelMap | None:
         """What this element does in flat pixels, or None."""
         return None
+
+    def check(self) -> None:
+        """ValueError where training or loading brought in what the constructor refuses, beside NaN."""
 
     def extra_repr(self) -> str:
         """The arguments."""
@@ -213,13 +216,19 @@ class ApertureMap(Aperture):
         super().__init__()
         _check_aperture(width, name="width")
         _check_map(transmission, name="transmission")
-        if transmission.min() < 0 or transmission.max() > 1:
-            low, high = float(transmission.min()), float(transmission.max())
-            raise ValueError(f"transmission must be in [0, 1], got {low:g}..{high:g}; divide by its maximum.")
-        if not (transmission > 0).any():
-            raise ValueError("transmission is 0 everywhere: no light passes this aperture. Open at least one pixel.")
         set_tensor(self, "transmission", transmission)
         set_scalar(self, "width", width)
+        self.check()
+
+    def check(self) -> None:
+        low, high = (float(value) for value in self.transmission.detach().aminmax())
+        if low < 0 or high > 1:
+            raise ValueError(
+                f"transmission must be in [0, 1], got {low:g}..{high:g}; divide by its maximum, and where it trains, "
+                "clamp_(0, 1) it after each step."
+            )
+        if high == 0:
+            raise ValueError("transmission is 0 everywhere: no light passes this aperture. Open at least one pixel.")
 
     def semi_aperture(self) -> Tensor:
         return float64(self.width) / 2
@@ -253,11 +262,20 @@ class ThinLens(Element):
 
     def __init__(self, focal_length: Scalar) -> None:
         super().__init__()
-        value = float(float64(focal_length).detach())
-        if value == 0 or value != value or abs(value) == float("inf"):
-            raise ValueError(f"focal_length must be finite and not 0 m, got {value:g}.")
-        _check_not_flat(value, name="focal_length")
+        as_numbers(focal_length, name="focal_length", expected="a number of metres such as 50 * mm")
         set_scalar(self, "focal_length", focal_length)
+        self.check()
+        _check_not_flat(float(float64(focal_length).detach()), name="focal_length")
+
+    def check(self) -> None:
+        value = float(float64(self.focal_length).detach())
+        if value == 0 or value != value or abs(value) == float("inf"):
+            raise ValueError(f"focal_length must be finite and not 0 m, got {value:g}. Use one such as 50 * mm.")
+        if abs(value) < LEAST_DISTANCE:
+            raise ValueError(
+                f"focal_length {value:g} m is shorter than {LEAST_DISTANCE:g} m, than light itself. Use one such as "
+                "50 * mm."
+            )
 
     def vergence(self, wavelengths: Tensor) -> Tensor:
         return -1 / float64(self.focal_length).to(wavelengths.device) * torch.ones_like(wavelengths)
@@ -341,10 +359,12 @@ class DOE(Element):
     Args:
         phase: (n, n) at the design wavelength [rad], wrapped or not; rows along +y, columns along +x; a Parameter
         trains. design_wavelength: lambda0 [m]. glass: name or index.
-        pitch: of the map's pixels [m]; None: the map spans the aperture's bounding square.
+        pitch: of the map's pixels [m]; None: the map spans the aperture's bounding square. A map that ends inside the
+            aperture goes on with its outermost pixels to the rim; of one that reaches beyond it the rest is unused.
         levels: heights that a fab can etch in one wave of phase; None: continuous. The gradient passes straight
             through.
-    Raises:  ValueError for a map that is not square or not finite, levels < 2, a wavelength not in metres.
+    Raises:  ValueError for a map that is not square or not finite, levels < 2, a wavelength not in metres, a pitch
+        outside 1e-8..0.05 m.
     """
 
     phase: Tensor
@@ -361,7 +381,7 @@ class DOE(Element):
         super().__init__()
         _check_map(phase, name="phase")
         if pitch is not None:
-            check_positive(pitch, name="pitch")
+            check_length(pitch, name="pitch", within=DOE_PITCH_RANGE, example="10 * um")
         if levels is not None and not (isinstance(levels, int) and levels >= 2):
             raise ValueError(f"levels must be an integer >= 2 (heights per wave), got {levels!r}.")
         _diffractive_factors(design_wavelength, glass, wavelength_grid([550e-9]))

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Integral
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +16,8 @@ from kcam.optics.explain import Explanation, explain
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
 from kcam.optics.pupil import disc_weights, unfold_quadrant
-from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
+from kcam.optics.sampling import MAX_PUPIL_SAMPLES
+from kcam.units import check_distances, check_pixel_pitch, check_positive, check_trained, wavelength_grid
 
 TESTED_F_NUMBERS = (1.8, 100.0)
 """Within these the non-paraxial PSF is held to Rayleigh-Sommerfeld, on the axis and within 1e-2.
@@ -232,20 +234,27 @@ class Lens(nn.Module):
         device: torch.device | None = None,
     ) -> Query:
         """The arguments of `psf`, checked, as one value."""
-        if not isinstance(shape, Sequence) or len(shape) != 2 or any(not isinstance(n, int) or n < 1 for n in shape):
+        if not isinstance(shape, Sequence) or len(shape) != 2 or not all(_is_count(n) for n in shape):
             fix = f" Use shape=({shape}, {shape})." if isinstance(shape, int) and shape >= 1 else ""
             raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.{fix}")
         if not 0 < fill_factor <= 1:
             raise ValueError(f"fill_factor {fill_factor:g} must be in (0, 1]: the light-sensitive share of a pixel.")
-        if samples is not None and (not isinstance(samples, int) or samples < 32):
+        if samples is not None and (not isinstance(samples, Integral) or samples < 32):
             raise ValueError(f"samples must be an integer >= 32 across the pupil, or None, got {samples!r}.")
+        if samples is not None and samples > MAX_PUPIL_SAMPLES:
+            raise ValueError(
+                f"samples {samples} across the pupil is above the limit of {MAX_PUPIL_SAMPLES}. Leave samples out for "
+                "as many as this PSF needs, or use a smaller shape."
+            )
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}; cast the result instead.")
         if device is None:
             device = next((t.device for t in (*self.parameters(), *self.buffers())), torch.device("cpu"))
         grid = check_distances(distances).to(device)
-        if grid.ndim > 1:
-            raise ValueError(f"distances must be a number or a vector (Z,), got shape {tuple(grid.shape)}.")
+        if grid.ndim > 1 or grid.numel() == 0:
+            raise ValueError(
+                f"distances must be a number or a vector (Z,) with Z >= 1, got shape {tuple(grid.shape)}. Use [2.0]."
+            )
         self._check_trained()
         self._check_curvature()
         self._check_f_number()
@@ -259,7 +268,7 @@ class Lens(nn.Module):
             device=device,
             integrate=integrate,
             active=math.sqrt(fill_factor),
-            samples=samples,
+            samples=None if samples is None else int(samples),
         )
 
     def mtf(
@@ -292,18 +301,19 @@ class Lens(nn.Module):
             integrate=integrate,
             dtype=dtype,
         )
+        height, width = query.shape
         curves = []
         for wavelength in query.wavelengths:
             # sampled finer than the pixels, and times the pixel's sinc: the pixels' own samples would alias
             fine = 2 * _points_per_pixel(query, wavelength) + 1
-            points = _between_pixels(query, wavelength, fine=fine, shape=(shape[0] * fine, shape[1] * fine))
+            points = _between_pixels(query, wavelength, fine=fine, shape=(height * fine, width * fine))
             image = choose(points, propagator=propagator, method=method)(points)[:, 0]
             otf = torch.fft.fftshift(torch.fft.fft2(image), dim=(-2, -1))
             magnitude2 = otf.real.square() + otf.imag.square()
             # a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
             modulation = torch.sqrt(magnitude2 + torch.finfo(dtype).tiny)
-            total = modulation[..., shape[0] * fine // 2, shape[1] * fine // 2][..., None, None]
-            for dim, n in zip((-2, -1), shape, strict=True):
+            total = modulation[..., height * fine // 2, width * fine // 2][..., None, None]
+            for dim, n in zip((-2, -1), query.shape, strict=True):
                 modulation = modulation.narrow(dim, n * fine // 2 - n // 2, n)
                 frequency = (torch.arange(n, device=modulation.device) - n // 2) / n  # cycles per pixel
                 if integrate:
@@ -404,12 +414,9 @@ class Lens(nn.Module):
     def _check_trained(self) -> None:
         """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
         for name, value in (*self.named_parameters(), *self.named_buffers()):
-            bad = int((~torch.isfinite(value.detach())).sum())
-            if bad:
-                raise ValueError(
-                    f"{name} of the lens has {bad} values that are NaN or infinite; expected finite ones everywhere. "
-                    "Load values from before they were lost, and train with a smaller step."
-                )
+            check_trained(value, name=f"{name} of the lens")
+        for element in self.elements:
+            element.check()
         check_positive(self.sensor_distance, name="sensor_distance")
         check_positive(self.aperture.semi_aperture(), name="semi-aperture")
 
@@ -436,6 +443,10 @@ class Lens(nn.Module):
                     f"the aperture reaches r = {reach:g} m, but the surface ends at its radius of curvature "
                     f"R = {radius:g} m (r >= R). Use an aperture below {2 * radius:g} m across or a larger R."
                 )
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, Integral) and int(value) >= 1
 
 
 def _points_per_pixel(query: Query, wavelength: Tensor) -> int:

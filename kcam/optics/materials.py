@@ -1,4 +1,8 @@
-"""Refractive indices of optical glasses, crystals and polymers by their published Sellmeier equations."""
+"""Refractive indices of optical glasses, crystals and polymers by their published Sellmeier equations.
+
+All hold over the default bands, 420 to 720 nm, but PMMA and polycarbonate, which start at 436.8 nm, and ZnSe, at
+540 nm: scenes for these need wavelengths of their own.
+"""
 
 from __future__ import annotations
 
@@ -154,7 +158,8 @@ def refractive_index(glass: str | float, *, wavelengths: Tensor) -> Tensor:
 
     Args:      glass: a name in `GLASSES`, or a number > 1 for an index without dispersion; wavelengths: (L,) [m].
     Returns:   (L,) float64.
-    Raises:    ValueError for an unknown glass, an index <= 1, or a wavelength outside the range of the fit.
+    Raises:    ValueError for an unknown glass, an index <= 1, or a wavelength outside the range of the fit: for PMMA,
+               polycarbonate and ZnSe those of the default bands.
     Source:    cited for each glass in `GLASSES`; polymers are good to 1e-3, all others to 2e-5 at room temperature.
 
     >>> round(float(refractive_index("N-BK7", wavelengths=torch.tensor([587.5618e-9], dtype=torch.float64))), 4)
@@ -171,9 +176,11 @@ def refractive_index(glass: str | float, *, wavelengths: Tensor) -> Tensor:
     low, high = entry.valid
     outside = (micrometres < low) | (micrometres > high)
     if outside.any():
+        first = 10 * (int(max(low * 1e3, 419)) // 10 + 1)  # of the default bands as many as there are, in round numbers
         raise ValueError(
             f"wavelength {float(micrometres[outside][0]) * 1e3:.6g} nm is outside the Sellmeier range of {glass}, "
-            f"{low * 1e3:g}..{high * 1e3:g} nm ({entry.source}); choose another glass or a constant index."
+            f"{low * 1e3:g}..{high * 1e3:g} nm ({entry.source}). Give the scene wavelengths within it, such as "
+            f"torch.linspace({first}, 720, 28) * nm, or choose another glass or a constant index."
         )
     x2 = micrometres**2
     resonances = (b * x2 / (x2 - c) for b, c in zip(entry.b, entry.c, strict=True))

@@ -15,10 +15,11 @@ from torch import Tensor, nn
 from kcam.optics.angular_spectrum import angular_spectrum_psf, spectrum_grids
 from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, map_phase, trace
 from kcam.optics.polar import radial_psf
-from kcam.optics.psf import Query, fft_grid, grid_psf, samples_by_rule
+from kcam.optics.psf import Query, fft_grid_for, grid_psf, samples_by_rule
 from kcam.optics.pupil import EDGE_MARGIN
 from kcam.optics.rays import geometric_psf
 from kcam.optics.reference import PIXELS_LIMIT, SMOOTH_LIMIT, reference_psf
+from kcam.optics.sampling import MAX_PUPIL_SAMPLES
 from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 
@@ -129,11 +130,8 @@ def _grid_estimate(method: str) -> Callable[[Query], float]:
             index = int((query.wavelengths - rays.wavelength).abs().argmin())
             spread = float(displacement[index])
             if method == "fft":
-                per_pixel, reach = query.evaluation_grid(rays.wavelength)
-                step = query.pixel_pitch / per_pixel
-                shortest = max(math.ceil(2 * query.kappa * (query.half_window + spread) / step), 2 * reach + 1)
-                _, length, _ = fft_grid(2 * math.pi * semi * step / (rays.wavelength * d), shortest=shortest)
-                period = length * step
+                _, length, _ = fft_grid_for(query, displacement=spread, wavelength=rays.wavelength)
+                period = length * query.pixel_pitch / query.evaluation_grid(rays.wavelength)[0]
             else:
                 count = query.samples or samples_by_rule(query, displacement=spread, wavelength=rays.wavelength)
                 period = rays.wavelength * d * (count - 2 * EDGE_MARGIN) / (2 * semi)
@@ -220,14 +218,24 @@ def _needs_few_samples(query: Query) -> str | None:
 
 
 def _needs_fine_points(query: Query) -> str | None:
-    """An FFT as long as its pupil has bins lambda d / 2a apart; coarser points would fold the pupil onto itself."""
+    """An FFT as long as its pupil has bins lambda d / 2a apart; coarser points would fold the pupil onto itself.
+
+    And bins that fall on the points ask for up to twice the samples of other transforms.
+    """
     finest = (
         float(query.wavelengths.min())
         * float(query.sensor_distance.detach())
         / (2 * float(query.image_side_semi_aperture.detach()))
     )
     if query.integrate or query.pixel_pitch < 0.9 * finest:
-        return None
+        grids = zip(query.displacement.tolist(), query.wavelengths.tolist(), strict=True)
+        count = max((fft_grid_for(query, displacement=s, wavelength=w)[0] for s, w in grids), default=0)
+        if count <= MAX_PUPIL_SAMPLES:
+            return None
+        return (
+            f"needs {count} pupil samples for bins that fall on the points, more than the limit of "
+            f"{MAX_PUPIL_SAMPLES}; use method='matrix' or a smaller shape."
+        )
     return (
         f"cannot place its bins on points {query.pixel_pitch:g} m apart (needs less than {0.9 * finest:.3g} m); use "
         "method='matrix', or integrate over the pixels."

@@ -258,7 +258,8 @@ def grid_samples(query: Query, *, displacement: Tensor, wavelength: float, index
             raise ValueError(
                 f"this PSF needs {needed} pupil samples at {wavelength * 1e9:.4g} nm (blur "
                 f"{geometry['displacement'] * 1e3:.3g} mm, window {2 * query.half_window * 1e3:.3g} mm), more than "
-                f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape, method='radial', or propagator='geometric'."
+                f"the limit of {sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape, method='radial', or "
+                "propagator='geometric'."
             )
         return needed
     if sampling.kappa_of(query.samples, **geometry) <= 1:
@@ -289,7 +290,7 @@ def _grid_group(
 ) -> Tensor:
     wavelengths = query.wavelengths[members].to(query.device)
     wavenumbers = 2 * math.pi / wavelengths
-    curved = query.curved_kernel and query.lens.has_pixels and not query.paraxial
+    curved = _curved(query)
     semi_aperture = query.semi_aperture if curved else query.image_side_semi_aperture
     slope = mean_slope(float(query.tau.detach())) if curved else 1.0
     scales = wavenumbers * semi_aperture / query.sensor_distance
@@ -299,9 +300,8 @@ def _grid_group(
 
     spacing, length = grid_spacing(count), 0
     if method == "fft":
-        scale_step = float(scales[0].detach()) * slope * step
-        extent = 2 * query.kappa * (query.half_window + float(displacement[members[0]])) / step
-        count, length, spacing = fft_grid(scale_step, shortest=max(math.ceil(extent), 2 * reach + 1))
+        spread, wavelength = float(displacement[members[0]]), float(wavelengths[0])
+        count, length, spacing = fft_grid_for(query, displacement=spread, wavelength=wavelength)
     nodes = grid_nodes(count, spacing=spacing)
 
     cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
@@ -347,6 +347,21 @@ def _curve(
     orders = [Curvature.order_for(strength, tau=tau, error=1e-8, corner=corner) for strength in strengths]
     shared = Curvature.build(kernels[0], nodes, tau=tau, step=step, reach=reach, order=max(orders), like=like)
     return [CurvedTransform(*parts) for parts in zip(kernels, itertools.repeat(shared), strengths, orders)]
+
+
+def _curved(query: Query) -> bool:
+    return query.curved_kernel and query.lens.has_pixels and not query.paraxial
+
+
+def fft_grid_for(query: Query, *, displacement: float, wavelength: float) -> tuple[int, int, float]:
+    """`fft_grid` for one wavelength of a query, whose light is displaced so far [m]."""
+    per_pixel, reach = query.evaluation_grid(wavelength)
+    step = query.pixel_pitch / per_pixel
+    semi_aperture, distance = query.scale
+    if _curved(query):
+        semi_aperture = float(query.semi_aperture.detach()) * mean_slope(float(query.tau.detach()))
+    shortest = max(math.ceil(2 * query.kappa * (query.half_window + displacement) / step), 2 * reach + 1)
+    return fft_grid(2 * math.pi * semi_aperture * step / (wavelength * distance), shortest=shortest)
 
 
 def fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:

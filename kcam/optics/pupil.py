@@ -23,6 +23,7 @@ from torch import Tensor
 EDGE_MARGIN = 12  # samples of the grid beyond the rim, where low-passed edges still differ from zero
 _EDGE_HALF_WIDTH = 6  # samples; half width of the low-pass for edge weights
 FINE = 5  # cells per sample in which the area of the rim is measured exactly
+_NODES_AT_ONCE = 32  # rows of edge weights; more take more memory than the cells that they share take time
 _SLAB_COLUMNS = 32  # of a banded matrix: narrow enough to leave out most zeros, wide enough for a matrix product
 _MAP_HALF_WIDTH = 12  # samples; half width of the low-pass that brings a pixel map onto the pupil grid
 _MAP_BETA = 7.9  # 80 dB: passes 0.79 of the Nyquist frequency and stops from 1.21; kappa 2.5 needs 0.8 and 1.2
@@ -171,20 +172,21 @@ def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     if radius <= 0:
         return torch.zeros(count // 2, count // 2, dtype=torch.float64)
     half = count // 2
-    reach = _EDGE_HALF_WIDTH * FINE
-    cells = half * FINE + reach + 1
-    edges = np.arange(cells + 1) * (spacing / FINE / radius)
-    area = _disc_area_below(edges[:, None], edges[None, :])
-    coverage = np.diff(np.diff(area, axis=0), axis=1) / (spacing / FINE / radius) ** 2
-    kernel = torch.as_tensor(_edge_taps())
-
-    quadrant = torch.as_tensor(coverage)
-    for _ in range(2):  # rows, then (transposed) columns; mirrored about the axis for the taps that reach across it
-        mirrored = torch.cat([quadrant[:, : reach + 1].flip(1), quadrant], dim=1)
-        start = (FINE - 1) // 2  # node j sits at the centre of cell 5 j + 2
-        signal = mirrored[:, start : start + (half - 1) * FINE + kernel.numel()]
-        quadrant = torch.nn.functional.conv1d(signal[:, None], kernel[None, None], stride=FINE)[:, 0].T
-    return quadrant.contiguous()
+    cell = spacing / FINE / radius
+    kernel = torch.as_tensor(_edge_taps())[None, None]
+    taps = kernel.shape[-1]
+    # node j sits at the centre of cell 5 j + 2; its taps reach across the axis, where the area is odd in each edge
+    edges = (np.arange((half - 1) * FINE + taps + 1) + (FINE - 1) // 2 - taps // 2) * cell
+    quadrant = torch.empty(half, half, dtype=torch.float64)
+    for first in range(0, half, _NODES_AT_ONCE):  # of cells 25 times as many as nodes only a few rows are held
+        last = min(first + _NODES_AT_ONCE, half)
+        rows = edges[first * FINE : (last - 1) * FINE + taps + 1, None]
+        area = _disc_area_below(np.abs(rows), np.abs(edges)) * np.sign(rows) * np.sign(edges)
+        signal = torch.as_tensor(np.diff(np.diff(area, axis=0), axis=1) / cell**2)
+        for _ in range(2):  # along the rows, then (transposed) along the columns
+            signal = torch.nn.functional.conv1d(signal[:, None], kernel, stride=FINE)[:, 0].T
+        quadrant[first:last] = signal
+    return quadrant
 
 
 def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing: float) -> Tensor:

@@ -16,7 +16,8 @@ KAPPA = 2.7  # pupil samples per cycle of the fastest fringe that reaches the wi
 WINDOW_MARGIN = 8  # pixels evaluated beyond the window, so that the pixel's sinc filter finds its light there
 _NYQUIST_SHARE = 0.95  # of the intensity's Nyquist pitch lambda d / 4a that the evaluation grid may use
 _CONTINUED = 64  # points over which the outermost value continues
-MAX_PUPIL_SAMPLES = 16_384
+MAX_PUPIL_SAMPLES = 8192
+"""Across a pupil grid. A PSF takes up to 40 float64 numbers for each sample: 21 GB at this limit, 86 GB at twice it."""
 
 
 def pupil_samples(

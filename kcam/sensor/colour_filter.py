@@ -24,7 +24,7 @@ from kcam.context import Context, Stage
 from kcam.precision import full_precision
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import hold
-from kcam.units import nm, wavelength_grid
+from kcam.units import check_trained, nm, wavelength_grid
 
 BASIS_SIZE = 12
 SPACING = 300 * nm / (BASIS_SIZE - 1)
@@ -218,7 +218,11 @@ class ColourFilter(Stage):
         return self.coefficients.ndim == 3
 
     def alpha(self) -> Tensor:
-        """The weights of the Gaussians, (C,12) or (t,t,12), >= 0."""
+        """The weights of the Gaussians, (C,12) or (t,t,12), >= 0.
+
+        Raises:    ValueError for coefficients that were trained or loaded into NaN.
+        """
+        check_trained(self.coefficients, name="coefficients of the colour filter")
         return F.softplus(self.coefficients, beta=SHARPNESS) if self.softplus else self.coefficients
 
     def basis(self, wavelengths: Tensor) -> Tensor:
@@ -226,6 +230,7 @@ class ColourFilter(Stage):
         grid = wavelength_grid(wavelengths).to(self.coefficients.device)
         basis = gaussian_basis(grid, width=self.width)
         if self.infrared_cut is not None:
+            check_trained(torch.as_tensor(self.infrared_cut), name="infrared_cut of the colour filter")
             basis = basis * infrared_transmission(grid, edge=self.infrared_cut)
         return basis
 

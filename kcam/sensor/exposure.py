@@ -11,7 +11,7 @@ from torch import Tensor
 from kcam.context import Context, Stage
 from kcam.sensor.colour_filter import REFERENCE_BANDWIDTH, ColourFilter
 from kcam.sensor.noise import hold
-from kcam.units import check_positive, nm
+from kcam.units import as_numbers, check_positive, nm
 
 PLANCK_TIMES_LIGHT = 1.986445857e-25
 """h c [J m], from the exact SI values of both."""
@@ -116,9 +116,10 @@ class Exposure(Stage):
     ):
         super().__init__()
         for name, share in (("white_share", white_share), ("quantum_efficiency", quantum_efficiency)):
-            value = 1.0 if share is None else torch.as_tensor(share).detach()
+            expected = "a share, above 0 and at most 1, such as 0.8"
+            value = 1.0 if share is None else as_numbers(share, name=name, expected=expected).detach()
             if not 0 < value <= 1:
-                raise ValueError(f"{name} must be a share, above 0 and at most 1, such as 0.8; got {value:g}.")
+                raise ValueError(f"{name} must be {expected}; got {value:g}.")
         if time is not None:
             check_positive(time, name="time", unit="s")
         if iso is not None:

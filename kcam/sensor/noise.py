@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from kcam.context import Context, Stage
 from kcam.precision import full_precision
 from kcam.ste import clip_ste
-from kcam.units import check_positive
+from kcam.units import as_numbers, check_positive
 
 
 def hold(stage: nn.Module, **arguments: Any) -> None:
@@ -48,7 +48,7 @@ def like(value: Tensor | float, signal: Tensor) -> Tensor | float:
 
 def check_not_negative(value: Tensor | float, *, name: str, unit: str) -> None:
     """ValueError unless every element of `value` is finite and >= 0."""
-    values = torch.as_tensor(value).detach()
+    values = as_numbers(value, name=name, expected=f"a number >= 0 {unit}").detach()
     bad = ~((values >= 0) & values.isfinite())
     if bad.any():
         raise ValueError(f"{name} must be finite and >= 0 {unit}, got {values[bad].flatten()[0].item():g}.")

@@ -223,6 +223,29 @@ class TestErrors:
             with pytest.raises(ValueError, match="the signal has 2 channels"):
                 stage(torch.zeros(1, 2, 2, 2))
 
+    def test_sequences_are_taken(self) -> None:
+        signal = torch.rand(1, 3, 4, 4)
+        rows = [[1.5, -0.5, 0.0], [0.0, 1.0, 0.0], [0.0, -0.25, 1.25]]
+        for stage, same in (
+            (isp.WhiteBalance([1.65, 1.0, 1.18]), isp.WhiteBalance(torch.tensor([1.65, 1.0, 1.18]))),
+            (isp.ColourMatrix(rows), isp.ColourMatrix(torch.tensor(rows))),
+        ):
+            torch.testing.assert_close(stage(signal), same(signal), rtol=0, atol=0)
+        mosaic, plain = torch.rand(1, 1, 8, 8), isp.Demosaic(gains=torch.tensor([1.65, 1.0, 1.18]))
+        torch.testing.assert_close(isp.Demosaic(gains=(1.65, 1.0, 1.18))(mosaic), plain(mosaic))
+
+    def test_what_no_signal_can_fit_is_refused_at_once(self) -> None:
+        with pytest.raises(ValueError, match=r"matrix must be three rows .* torch.eye\(3\), .* got shape \(1, 1\)"):
+            isp.ColourMatrix([[1]])
+        with pytest.raises(ValueError, match=r"matrix must be three rows .* got shape \(3,\)"):
+            isp.ColourMatrix(torch.ones(3))
+        with pytest.raises(TypeError, match="matrix must be three rows .* got 'identity'"):
+            isp.ColourMatrix("identity")
+        with pytest.raises(ValueError, match=r"gains must be one number per channel .* got shape \(1, 3\)"):
+            isp.WhiteBalance([[1.0, 1.0, 1.0]])
+        with pytest.raises(TypeError, match="gains must be one number per channel such as .* got 'auto'"):
+            isp.Demosaic(gains="auto")
+
     def test_shapes(self) -> None:
         with pytest.raises(ValueError, match=r"gains of shape \(4,\) do not fit a signal of 3 channels"):
             isp.WhiteBalance(torch.ones(4))(torch.zeros(1, 3, 2, 2))

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from kcam import optics
+from kcam.optics.propagation import choose
 from kcam.units import mm, nm, um
 
 WAVELENGTH = 550 * nm
@@ -198,13 +199,19 @@ QUERIES = [
     ({"wavelengths": [0.55]}, r"wavelength 0.55 is outside .* did you mean 0.55 \* um"),
     ({"wavelengths": []}, r"wavelengths must be a vector \(L,\) with L >= 1"),
     ({"wavelengths": torch.zeros(2, 2)}, r"wavelengths must be a vector .* got shape \(2, 2\)"),
+    ({"wavelengths": [float("nan")]}, r"wavelength nan is outside .* in metres, such as 550 \* nm\.$"),
+    ({"wavelengths": [-550 * nm]}, r"wavelength -5.5e-07 is outside .* in metres, such as 550 \* nm\.$"),
+    ({"pixel_pitch": float("nan")}, r"pixel_pitch nan is outside .* in metres, such as 4 \* um\.$"),
     ({"pixel_pitch": 4.0}, r"pixel_pitch 4 is outside .* did you mean 4 \* um"),
     ({"pixel_pitch": 4000.0}, r"pixel_pitch 4000 is outside .* did you mean 4000 \* nm"),
     ({"pixel_pitch": -4 * um}, r"pixel_pitch -4e-06 is outside"),
     ({"distances": 0.0}, r"distance 0 is not a distance in front of the lens"),
     ({"distances": [2.0, -1.0]}, r"distance -1 is not a distance"),
     ({"distances": float("nan")}, r"distance nan is not a distance"),
-    ({"distances": torch.ones(2, 2)}, r"distances must be a number or a vector \(Z,\), got shape \(2, 2\)"),
+    ({"distances": torch.ones(2, 2)}, r"distances must be a number or a vector \(Z,\) .* got shape \(2, 2\)"),
+    ({"distances": []}, r"distances must be .* a vector \(Z,\) with Z >= 1, got shape \(0,\)"),
+    ({"distances": torch.zeros(0)}, r"distances must be .* a vector \(Z,\) with Z >= 1, got shape \(0,\)"),
+    ({"distances": 1e-300}, r"distance 1e-300 is too near: expected metres >= 1e-07"),
     ({"shape": (33,)}, r"shape must be two positive integers \(H, W\) in pixels, got \(33,\)"),
     ({"shape": 33}, r"shape must be two positive .* got 33. Use shape=\(33, 33\)"),
     ({"shape": (33, 0)}, r"shape must be two positive integers"),
@@ -213,6 +220,7 @@ QUERIES = [
     ({"method": "nufft"}, r"nonparaxial has no method 'nufft'; known: matrix, chirp_z, fft, radial"),
     ({"propagator": "geometric", "method": "fft"}, r"geometric has no method 'fft'; known: rays"),
     ({"samples": 16}, r"samples must be an integer >= 32 .* got 16"),
+    ({"samples": 10**6}, r"samples 1000000 across the pupil is above the limit of 8192. Leave samples out"),
     ({"samples": 64.0}, r"samples must be an integer >= 32 .* got 64.0"),
     ({"fill_factor": 0.0}, r"fill_factor 0 must be in \(0, 1\]"),
     ({"fill_factor": 1.5}, r"fill_factor 1.5 must be in \(0, 1\]"),
@@ -224,6 +232,67 @@ QUERIES = [
 def test_bad_queries_say_what_is_wrong(change: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         thin_lens().psf(**(PSF | change))
+
+
+def test_the_nearest_distance_still_has_a_psf() -> None:
+    assert thin_lens().psf(**(PSF | {"distances": 1e-7})).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"wavelengths": "all"}, r"wavelengths must be numbers of metres such as \[450 \* nm.*got 'all'. Write a"),
+        ({"wavelengths": ["550 nm"]}, r"wavelengths must be numbers of metres .* got \['550 nm'\]"),
+        ({"distances": "2 m"}, r"distance must be a number of metres such as 2.0, got '2 m'. Write a number, not text"),
+        ({"distances": None}, r"distance must be a number of metres such as 2.0, got None"),
+        ({"pixel_pitch": "3um"}, r"pixel_pitch must be a number of metres such as 4 \* um, got '3um'. Write a number"),
+        ({"pixel_pitch": [3 * um, 3 * um]}, r"pixel_pitch must be a number of metres .*, got 2 of them"),
+    ],
+)
+def test_what_is_no_number_is_named(change: dict, text: str) -> None:
+    with pytest.raises(TypeError, match=text):
+        thin_lens().psf(**(PSF | change))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, r"focal_length must be finite and not 0 m, got 0. Use one such as 50 \* mm"),
+        (1e-30, r"focal_length 1e-30 m is shorter than 1e-07 m"),
+    ],
+)
+def test_a_focal_length_trained_to_nothing_is_an_error(value: float, text: str) -> None:
+    focal = nn.Parameter(torch.tensor(50 * mm))
+    lens = optics.Lens(ROUND, optics.ThinLens(focal), focus_distance=2.0)
+    with torch.no_grad():
+        focal.fill_(value)
+    with pytest.raises(ValueError, match=text):
+        lens.psf(**PSF)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "transmission is 0 everywhere: no light passes this aperture. Open at least one pixel"),
+        (-1.0, r"transmission must be in \[0, 1\], got -1..-1; .* where it trains, clamp_\(0, 1\) it after each step"),
+        (3.0, r"transmission must be in \[0, 1\], got 3..3"),
+    ],
+)
+def test_a_transmission_trained_out_of_its_range_is_an_error(value: float, text: str) -> None:
+    transmission = nn.Parameter(torch.ones(4, 4))
+    aperture = optics.ApertureMap(transmission, width=5 * mm)
+    lens = optics.Lens(aperture, optics.ThinLens(50 * mm), focus_distance=2.0)
+    with torch.no_grad():
+        transmission.fill_(value)
+    with pytest.raises(ValueError, match=text):
+        lens.psf(**PSF)
+
+
+def test_counts_may_be_numpys() -> None:
+    lens, plain = thin_lens(), PSF | {"shape": (33, 31), "samples": 64}
+    numpys = plain | {"shape": (np.int64(33), np.int32(31)), "samples": np.int64(64)}
+    for ask in (lens.psf, lens.mtf, lens.encircled_energy):
+        torch.testing.assert_close(ask(**numpys), ask(**plain), rtol=0, atol=0)
 
 
 def test_glass_and_wavelength_must_fit() -> None:
@@ -242,8 +311,19 @@ def test_a_pupil_too_coarse_for_the_window_is_an_error_that_names_the_sampling()
 
 def test_a_blur_beyond_all_sampling_is_an_error() -> None:
     lens = optics.Lens(optics.CircularAperture(20 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
-    with pytest.raises(ValueError, match=r"needs \d+ pupil samples at 550 nm .* more than 16384. Use a smaller shape"):
+    with pytest.raises(ValueError, match=r"needs \d+ pupil samples at 550 nm .* the limit of 8192. Use a smaller"):
         lens.psf(**(PSF | {"distances": 0.02}), method="matrix")
+
+
+def test_an_fft_that_would_take_too_many_samples_leaves_it_to_others() -> None:
+    """Bins that fall on the points ask for twice the samples, each of 320 bytes."""
+    aberration = torch.zeros(11)
+    aberration[10] = 1e-6
+    lens = optics.Lens(ROUND, optics.ThinLens(50 * mm), optics.ZernikeAberration(aberration), focus_distance=2.0)
+    query = PSF | {"pixel_pitch": 6 * um, "shape": (4001, 4001)}
+    with pytest.raises(ValueError, match=r"nonparaxial/fft needs \d+ pupil samples .* the limit of 8192; use method="):
+        lens.psf(**query, method="fft")
+    assert choose(lens.query(**query)).method == "chirp_z"
 
 
 def test_a_curvature_trained_into_the_aperture_is_an_error() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import oracles
 import pytest
 import torch
 
 from kcam.optics import GLASSES, refractive_index
-from kcam.units import nm
+from kcam.units import nm, wavelength_grid
 
 PUBLISHED = oracles.sellmeier_published()
 
@@ -58,6 +60,20 @@ def test_an_index_that_does_not_refract_is_an_error(glass: float) -> None:
 def test_unknown_glass_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"unknown glass 'BK7'; known: .*N-BK7.*; or give a refractive index"):
         index("BK7", 550 * nm)
+
+
+def test_the_default_bands_are_within_all_glasses_but_these() -> None:
+    bands, refused = wavelength_grid(), set()
+    for glass in GLASSES:
+        try:
+            refractive_index(glass, wavelengths=bands)
+        except ValueError as error:
+            refused.add(glass)
+            (first,) = re.findall(r"wavelengths within it, such as torch.linspace\((\d+), 720, 28\) \* nm", str(error))
+            refractive_index(glass, wavelengths=torch.linspace(int(first), 720, 28) * nm)
+    assert refused == {"PMMA", "polycarbonate", "ZnSe"}
+    with pytest.raises(ValueError, match=r"wavelength 420 nm is outside .* PMMA, 436\.8\.\.1052 nm .*linspace\(440,"):
+        refractive_index("PMMA", wavelengths=bands)
 
 
 def test_wavelength_beyond_the_fit_is_an_error() -> None:

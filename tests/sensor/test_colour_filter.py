@@ -220,6 +220,17 @@ def test_errors(build, error, text):
         build()
 
 
+@pytest.mark.parametrize("name", ["coefficients", "infrared_cut"])
+def test_a_filter_trained_into_nan_is_an_error(name):
+    cut = torch.nn.Parameter(torch.tensor(650e-9))
+    kodak = ColourFilter(torch.nn.Parameter(torch.rand(3, 12)), infrared_cut=cut)
+    with torch.no_grad():
+        getattr(kodak, name).fill_(torch.nan)
+    for ask in (lambda: kodak(torch.rand(1, 28, 4, 4)), lambda: kodak.contraction(wavelength_grid())):
+        with pytest.raises(ValueError, match=f"{name} of the colour filter has .* NaN or infinite; .* a smaller step"):
+            ask()
+
+
 def test_bands_and_wavelengths_must_agree():
     kodak, grid = ColourFilter.kodak(), wavelength_grid()
     with pytest.raises(ValueError, match="the signal has 31 bands, but there are 28 wavelengths"):

@@ -200,6 +200,13 @@ def test_errors(arguments, text):
         Exposure(**arguments)
 
 
+def test_what_is_no_number_is_named():
+    with pytest.raises(TypeError, match="time must be a number > 0 s, got '1/50'. Write a number, not text"):
+        Exposure(time="1/50")
+    with pytest.raises(TypeError, match="white_share must be a share, above 0 and at most 1, .*, got 'bright'"):
+        Exposure(white_share="bright")
+
+
 def test_time_needs_a_lens():
     with pytest.raises(ValueError, match=r"Exposure\(time=\.\.\.\) needs the lens.*put optics.Imaging"):
         Exposure(time=0.01)(torch.rand(1, 3, 2, 2))
