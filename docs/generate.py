@@ -606,6 +606,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.traps:
         measure_traps()
+    for name, draw in PICTURES.items() if options.pictures and not options.check else ():
+        draw(README.parent / "docs" / name)  # before the tables: some show what was measured for a picture
     before = README.read_text()
     with tempfile.TemporaryDirectory() as folder, inside(folder):
         after = with_output(with_tables(before))
@@ -613,8 +615,6 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.write("in step\n" if after == before else "out of step: run python docs/generate.py\n")
         return int(after != before)
     README.write_text(after)
-    for name, draw in PICTURES.items() if options.pictures else ():
-        draw(README.parent / "docs" / name)
     return 0
 
 

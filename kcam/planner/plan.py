@@ -300,4 +300,5 @@ def _time(seconds: float) -> str:
 
 
 def _metres(vergence: float) -> str:
-    return "infinity" if vergence < 1e-9 else f"{1 / vergence:.3g} m"
+    distance = 1 / vergence if vergence > 1e-9 else float("inf")
+    return "infinity" if distance > 1e9 else f"{distance:.3g} m" if distance < 1000 else f"{distance:.0f} m"
