@@ -23,6 +23,8 @@ from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 
 BORDERS = ("reflect", "replicate", "periodic", "zero")
+_CACHED = 2**20  # pixels beyond which a plane is no longer near the processor
+_UNFOLDED = 2**25  # bytes of a strip that is convolved directly
 _BANDS_AT_ONCE = 4  # at most, in the buffer of a contraction: small enough to stay in the processor's cache
 
 
@@ -74,7 +76,7 @@ class Renderer:
             kernels = torch.einsum("cg,gyx->cyx", self._grouped(self.weights), self.psfs[layer])
         kernels = kernels / kernels.sum((-2, -1), keepdim=True)
         if self.direct:
-            return torch.nn.functional.conv2d(extend(share, self.window, self.border), kernels[:, None])
+            return correlate(extend(share, self.window, self.border), kernels[:, None])
         transfers = self.convolution.transfer(kernels)
         return self._tiles(share, lambda part: self.convolution.back(self.convolution.transform(part) * transfers))
 
@@ -138,7 +140,7 @@ class Renderer:
         if self.direct:
             found = kernels()
             # the picture is upright, so the PSF is turned: a correlation, which is what conv2d computes
-            return lambda planes: torch.nn.functional.conv2d(extend(planes, self.window, self.border), found)
+            return lambda planes: correlate(extend(planes, self.window, self.border), found)
         convolution, count = self.convolution, mixing.shape[0] * mixing.shape[1]
         channels = self._transfers(count, lambda: convolution.transfer(kernels()), psfs, mixing)
 
@@ -170,7 +172,7 @@ class Renderer:
                 total = planes.new_zeros(())
                 for psf, part in zip(psfs, parts(planes), strict=True):
                     extended = extend(part, self.window, self.border).flatten(0, 1)[:, None]
-                    total = total + torch.nn.functional.conv2d(extended, psf[None, None]).unflatten(0, part.shape[:2])
+                    total = total + correlate(extended, psf[None, None]).unflatten(0, part.shape[:2])
                 return total.squeeze(2)
 
             return in_picture
@@ -189,7 +191,7 @@ class Renderer:
         if self.direct:
             light = planes if self.spectra is None else torch.einsum("bkhw,kl->blhw", planes, self.spectra)
             extended = extend(light, self.window, self.border)
-            return torch.nn.functional.conv2d(extended, psfs[:, None], groups=psfs.shape[0])
+            return correlate(extended, psfs[:, None], groups=psfs.shape[0])
 
         def band(planes: Tensor, psf: Tensor, index: int) -> Tensor:
             plane = (
@@ -281,14 +283,18 @@ def rendering_work(
         summed = products + (2 * out if coverage else 0)
         touched = (inputs + 2 * out) * pixels + mixed
         memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
-        return Work({"product": float(summed * pixels * kernel), "touch": touched}, memory)
+        slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
+        return Work({"product": float(summed * pixels * kernel * slow), "touch": touched}, memory)
     transforms = tiles * (inputs + out) + kernels
     touched = float(tiles * points * (inputs + out + products) + kernels * points) + mixed
     if coverage:
         transforms += tiles * 2 * (1 + out) + out
         touched += tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
     memory = float(itemsize * (held * points + (inputs + out) * pixels))
-    return Work({"transform": transforms * points * math.log2(max(2, points)), "touch": touched}, memory)
+    operations = {"transform": transforms * points * math.log2(max(2, points)), "touch": touched}
+    if pixels > _CACHED:  # whole it is touched again and again in far memory, in tiles once
+        operations["large"] = float(pixels * (inputs + out) * (2 if tiles == 1 else 1))
+    return Work(operations, memory)
 
 
 @dataclass(frozen=True)
@@ -440,6 +446,18 @@ def extend_adjoint(extended: Tensor, convolution: Convolution) -> Tensor:
         used = extended.narrow(dim, 0, n + before + after)
         extended = extended.new_zeros(shape).index_add_(dim, index, used)
     return extended
+
+
+def correlate(planes: Tensor, kernels: Tensor, *, groups: int = 1) -> Tensor:
+    """`conv2d` in strips of rows: it unfolds its input, which for a whole picture would be gigabytes."""
+    rows = planes.shape[-2] - kernels.shape[-2] + 1
+    unfolded = planes.shape[0] * planes.shape[-1] * planes.shape[-3] * kernels[0, 0].numel() * planes.element_size()
+    strip = max(1, int(_UNFOLDED // unfolded))
+    parts = [
+        torch.nn.functional.conv2d(planes[..., top : top + strip + kernels.shape[-2] - 1, :], kernels, groups=groups)
+        for top in range(0, rows, strip)
+    ]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
 
 
 def extend(planes: Tensor, window: tuple[int, int], border: str, *, zeros_after: bool = True) -> Tensor:

@@ -34,14 +34,15 @@ RATES: dict[str, float] = {
     "transform": 1.1e-10,
     "product": 8e-11,
     "touch": 1.2e-9,
+    "large": 1.6e-8,
     "layer": 1e-5,
 }
 """Kind of work -> seconds for one operation, on the machine where the defaults were measured (one core, float32).
 
 matrix, chirp_z, fft, radial, rays, quadrature: an operation as `Propagator.cost` counts it. map: a pixel of a DOE at a
 wavelength. bank, psf: a call, and each PSF in it. transform: n log2(n) of a real FFT of n points. product: a
-multiplication and addition in a convolution without FFT. touch: one pass over a number. layer: of depth, beside its
-transforms.
+multiplication and addition in a convolution without FFT. touch: one pass over a number. large: a number of a picture of
+more than a megapixel, once if in tiles. layer: of depth, beside its transforms.
 """
 
 LIKE = {"chirp_z": "matrix", "fft": "matrix", "quadrature": "matrix", "rays": "radial"}
@@ -152,6 +153,9 @@ def _pictures() -> Iterator[tuple[str, optics.Imaging, Scene, ColourFilter | Non
     yield "layers, smooth DOE", _imaging(lenses["smooth DOE"], layers=3), deep, colours
     yield "all bands", _imaging(symmetric, psf_shape=(65, 65)), flat, None
     yield "a large picture", _imaging(symmetric, psf_shape=(65, 65), bands=2), large, colours
+    huge = Scene.builtin("astronaut", 1300)
+    for label, tile in {"whole": None, "tiles": 256}.items():
+        yield f"a huge picture, {label}", _imaging(symmetric, psf_shape=(65, 65), bands=1, tile=tile), huge, colours
     yield "without blur", _imaging(symmetric, blur=False), large, colours
     yield "a cube", _imaging(symmetric, bands=2), Scene.from_bands(flat.bands(), depth=2.0), colours
     yield "a cube of low rank", _imaging(symmetric, bands=2, rank=4), Scene.from_bands(flat.bands(), depth=2.0), colours
