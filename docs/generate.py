@@ -355,7 +355,9 @@ def plans_picture(path: Path) -> None:
         for source in sorted(Path(folder).glob("*.json")):
             shutil.copy(source, PLANS / source.name)
         for name, target in (("tolerances", path), ("scenes", path.with_name("plans-scenes.jpg"))):
-            Image.open(Path(folder) / f"{name}.png").convert("RGB").save(target, quality=88, optimize=True)
+            picture = Image.open(Path(folder) / f"{name}.png").convert("RGB")
+            picture.thumbnail((2000, 2000), Image.Resampling.LANCZOS)
+            picture.save(target, quality=88, optimize=True)
 
 
 # ---- the benchmarks --------------------------------------------------------------------------------------------------

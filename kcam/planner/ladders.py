@@ -24,7 +24,6 @@ FEW_BANDS, FEW_LAYERS, TAIL = 3, 3, 16
 ORDER = 1.5
 """A ladder's error falls at least with this power of its step: two where it is fine enough, one where phases jump."""
 
-BANDS = (1, 2, 4, 7, 12, 19)
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 KAPPAS = (1.3, 1.7, 2.1)
@@ -182,8 +181,22 @@ def _precision(view: _View) -> Iterator[Ladder]:
         yield Ladder("precision", levels, view.beside)
 
 
+def even_counts(total: int) -> list[int]:
+    """Numbers of groups, ascending, each about twice the one before; those into which `total` divides evenly first.
+
+    Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are closer to all than 12
+    are, and 14 than 23.
+    """
+    counts = [1]
+    while counts[-1] < total:
+        near = range(math.ceil(1.5 * counts[-1]), math.floor(2.5 * counts[-1]) + 1)
+        even = [count for count in near if total % count == 0]
+        counts.append(even[-1] if even else 2 * counts[-1])
+    return [count for count in counts if count < total]
+
+
 def _wavelengths(view: _View) -> Iterator[Ladder]:
-    levels = [Level(f"{n} PSFs", {"bands": n}, n) for n in BANDS if n < view.bands]
+    levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in even_counts(view.bands)]
     top = Level(f"{view.bands} PSFs", {}, view.bands)
     yield Ladder("wavelengths", [*levels, top], view.few(bands=False), successive=True)
 

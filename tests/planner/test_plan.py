@@ -18,6 +18,7 @@ import kcam
 from benchmarks.planner import TOLERANCES, random_pair
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.planner import OutOfRange, Plan, Planner, noiseless_raw, relative_rms
+from kcam.planner.ladders import even_counts
 from kcam.units import mm, um, wavelength_grid
 
 
@@ -269,6 +270,13 @@ def test_memory_is_bounded_by_max_memory() -> None:
     assert plan.memory < wide.memory
     with torch.no_grad():
         assert plan.measure(camera(), light) <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("total", "counts"), [(28, [1, 2, 4, 7, 14]), (1, []), (2, [1]), (31, [1, 2, 4, 8, 16]), (36, [1, 2, 4, 9, 18])]
+)
+def test_bands_are_grouped_evenly(total: int, counts: list[int]) -> None:
+    assert even_counts(total) == counts
 
 
 # ---- the value -----------------------------------------------------------------------------------------------------
