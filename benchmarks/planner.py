@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcam import Camera, Scene, files, isp, measure, optics, sensor
+from kcam import Camera, Scene, isp, measure, optics, sensor
 from kcam.planner import Planner, noiseless_raw, relative_rms
 from kcam.units import mm, um, wavelength_grid
 
@@ -262,7 +262,7 @@ def main() -> None:
         "failures": failures,
         "pairs": pairs,
     }
-    files.replace(arguments.out, (json.dumps(content, indent=1) + "\n").encode())
+    measure.write_json(arguments.out, content)
     for row in content["summary"]:
         print(row)
     print(f"{len(failures)} failures, {again} pairs drawn again")
