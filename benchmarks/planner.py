@@ -15,14 +15,13 @@ import random
 import statistics
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcam import Camera, Scene, isp, measure, optics, sensor
-from kcam.planner import Planner, noiseless_raw, relative_rms
+from kcam.planner import Planner, relative_rms, timed
 from kcam.units import mm, um, wavelength_grid
 
 TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
@@ -187,15 +186,6 @@ def measure_pair(seed: int, *, tolerances: tuple[float, ...] = TOLERANCES, round
             }
         )
     return {"seed": seed, "pair": text, "drawn_again": again, "tolerances": rows}
-
-
-def timed(camera: Camera, scene: Scene) -> tuple[float, Tensor]:
-    """Seconds of the noiseless raw with new optics, and the raw."""
-    fresh = [stage.changed() if isinstance(stage, optics.Imaging) else stage for stage in camera]
-    raw = noiseless_raw(Camera(*fresh, context=camera.context))
-    start = perf_counter()
-    result = raw(scene)
-    return perf_counter() - start, result
 
 
 def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:

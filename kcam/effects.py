@@ -13,7 +13,7 @@ from kcam.context import Context
 
 @dataclass(frozen=True)
 class Work:
-    """Counts of operations by their kind (see `kcam.costs.RATES`), and memory at the peak [bytes].
+    """Counts of operations by their kind (see `kcam.planner.costs.RATES`), and memory at the peak [bytes].
 
     Two works one after the other add up their operations and need the larger memory.
     """

@@ -25,12 +25,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam import isp, measure, sensor
-from kcam.camera import DEMOSAICING, Camera
+from kcam.camera import Camera
 from kcam.optics import PROPAGATORS, Imaging
 from kcam.optics.propagation import PHYSICS, Propagator, choose
 from kcam.optics.psf import Query, samples_by_rule
 from kcam.optics.reference import Convergence, checked_psf
 from kcam.optics.textbook import textbook_angular_spectrum_row, textbook_row
+from kcam.planner.plan import ENDS, with_imaging
 from kcam.scene import Scene
 
 WINDOW, THOROUGH_WINDOW = 33, 65  # pixels in which PSFs are compared: the reference takes 4 to 24 s for six of 65 x 65
@@ -40,7 +41,6 @@ LONGEST, THOROUGH_LONGEST = 4.0, 120.0  # seconds of a picture above which its t
 ONCE = 2.5  # seconds of a picture above which one more call must do
 REFERENCE_KAPPA = 4.5  # of the reference picture's pupil sampling: a thousandth of the default's error
 KAPPAS, THOROUGH_KAPPAS = (1.3, 1.6, 2.0, 2.7, 3.5, 5.0), (1.15, 1.3, 1.6, 2.0, 2.35, 2.7, 3.5, 4.2, 5.0)
-ENDS = (sensor.ADC, *DEMOSAICING)  # what stands before the first of these is the raw signal, before rounding
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def settings(
     row = choose(query, propagator=imaging.propagator, method=imaging.method)
     result = [Setting("default", _called(row), camera, scene, optics=True, default=True)]
     if imaging.propagator != "nonparaxial":
-        camera = _with(camera, propagator="nonparaxial", method=None)
+        camera = with_imaging(camera, propagator="nonparaxial", method=None)
     for name, knob in KNOBS.items():
         if knobs is None or name in knobs:
             result += knob(camera, scene, thorough)
@@ -251,14 +251,14 @@ def settings(
 
 def _propagators(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
     for row in PROPAGATORS.values():
-        changed = _with(camera, propagator=row.physics, method=row.method)
+        changed = with_imaging(camera, propagator=row.physics, method=row.method)
         yield Setting("propagator", _called(row), changed, scene, optics=True)
 
 
 def _samples(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
     for count in _sample_counts(_imaging(camera), scene, THOROUGH_KAPPAS if thorough else KAPPAS):
-        # the radial transform has no pupil grid
-        yield Setting("samples", f"{count} samples", _with(camera, samples=count, method="matrix"), scene, optics=True)
+        changed = with_imaging(camera, samples=count, method="matrix")  # the radial transform has no pupil grid
+        yield Setting("samples", f"{count} samples", changed, scene, optics=True)
 
 
 def _precision(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
@@ -269,18 +269,18 @@ def _precision(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting
 def _wavelengths(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
     for count in (1, 3, 5, 7, 10, 14, 20) if thorough else (3, 7, 14):
         if count < len(scene.wavelengths):
-            yield Setting("wavelengths", f"{count} wavelengths", _with(camera, bands=count), scene, optics=True)
+            yield Setting("wavelengths", f"{count} wavelengths", with_imaging(camera, bands=count), scene, optics=True)
 
 
 def _layers(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
     rule = len(_imaging(camera).depth_layers(torch.as_tensor(scene.depth), scene.wavelengths))
     for count in (1, 2, 3, 5, 9, 2 * rule) if thorough else (1, 3, 9):
         if rule > 1 and count not in (1, rule):
-            yield Setting("depth", f"{count} layers", _with(camera, layers=count), scene)
+            yield Setting("depth", f"{count} layers", with_imaging(camera, layers=count), scene)
     for count in (1, 3, 9, rule):
         if rule > 1 and count <= rule:
             name = "1 layer" if count == 1 else f"{count} layers, nearest"
-            yield Setting("depth", name, _with(camera, layers=count, interpolate=False), scene)
+            yield Setting("depth", name, with_imaging(camera, layers=count, interpolate=False), scene)
 
 
 def _support(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
@@ -288,11 +288,11 @@ def _support(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
     for side in (5, 9, 17, 33, 65, 129, 257) if thorough else (9, 17, 33, 65, 129):
         if side < max(window):
             shape = (min(side, window[0]), min(side, window[1]))
-            yield Setting("support", f"{side} px", _with(camera, psf_shape=shape), scene, optics=True)
+            yield Setting("support", f"{side} px", with_imaging(camera, psf_shape=shape), scene, optics=True)
 
 
 def _integration(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
-    yield Setting("pixels", "point samples", _with(camera, integrate=False), scene, optics=True)
+    yield Setting("pixels", "point samples", with_imaging(camera, integrate=False), scene, optics=True)
 
 
 def _rank(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
@@ -323,11 +323,11 @@ def _demosaics(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting
 def _baselines(camera: Camera, scene: Scene, thorough: bool) -> Iterator[Setting]:
     for samples, points in ((256, 1), (891, 1), (891, 3)) + (((512, 1), (1783, 1)) if thorough else ()):
         name = f"textbook {samples}" + ("" if points == 1 else f", {points}x{points} a pixel")
-        changed = _with(camera, propagator=textbook_row(samples, points=points), method=None)
+        changed = with_imaging(camera, propagator=textbook_row(samples, points=points), method=None)
         yield Setting("baseline", name, changed, scene, optics=True, baseline=True)
     for points in (1, 2, 3) if thorough else (1, 2):
         name = "plain ASM" if points == 1 else f"plain ASM, {points}x{points} a pixel"
-        changed = _with(camera, propagator=textbook_angular_spectrum_row(points=points), method=None)
+        changed = with_imaging(camera, propagator=textbook_angular_spectrum_row(points=points), method=None)
         yield Setting("baseline", name, changed, scene, optics=True, baseline=True)
 
 
@@ -351,12 +351,6 @@ def _imaging(camera: Camera) -> Imaging:
         if isinstance(stage, Imaging):
             return stage
     raise ValueError("this camera has no optics.Imaging, so no knob trades its accuracy. Try Camera.phone().")
-
-
-def _with(camera: Camera, **arguments: Any) -> Camera:
-    """The camera with its Imaging changed; nothing kept."""
-    stages = [stage.changed(**arguments) if isinstance(stage, Imaging) else stage for stage in camera]
-    return Camera(*stages, context=camera.context)
 
 
 def _called(row: Propagator) -> str:
@@ -476,7 +470,7 @@ class _Truth:
         count = _sample_counts(imaging, scene, [REFERENCE_KAPPA])[0]
         # the Hankel form has no pupil grid, and no error of one
         finely = {} if imaging.lens.symmetric else {"samples": count}
-        fine = _with(camera, propagator="nonparaxial", method=None, **finely)
+        fine = with_imaging(camera, propagator="nonparaxial", method=None, **finely)
         double = scene.to(dtype=torch.float64)
         bank = _imaging(fine).psf_bank(query.wavelengths, vergences=query.vergences, shape=whole.shape, like=psfs)
         raw, picture = _shot(fine.noiseless(), double)
@@ -531,7 +525,7 @@ def _measured(setting: Setting, truth: _Truth, *, longest: float) -> Row:
             if seconds / share > longest:
                 return replace(row, seconds=seconds / share, share=share)
         camera = setting.camera.noiseless()
-        fresh = _with(camera)
+        fresh = with_imaging(camera)
         (raw, picture), first, memory = measure.watched(lambda: _shot(fresh, scene))
         kept = measure.cpu_time(lambda: _shot(fresh, scene)) if first < ONCE else None
     except (ValueError, MemoryError) as error:
@@ -611,7 +605,7 @@ def _timed(every: Sequence[Setting], rows: list[Row], *, deadline: float, advanc
             wanted = row.calls and (turn == 0 or (row.seconds or 0) < ONCE)
             if wanted and time.monotonic() + (row.seconds or 0) < deadline:
                 advance(f"round {turn + 1}, {setting.name}")
-                fresh = _with(camera)
+                fresh = with_imaging(camera)
                 own.append(measure.cpu_time(functools.partial(_shot, fresh, setting.scene)))
         if sum(map(len, times)) == before:
             break

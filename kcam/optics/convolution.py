@@ -71,9 +71,11 @@ class Renderer:
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
-        kernels = self._of_bands(self.psfs[layer])
-        if self.weights is not None:
-            kernels = torch.einsum("cg,gyx->cyx", self._grouped(self.weights), self.psfs[layer])
+        psfs = self.psfs[layer]
+        if self.weights is None:
+            kernels = self._of_bands(psfs)
+        else:
+            kernels = torch.einsum("cg,gyx->cyx", self._grouped(self.weights), psfs)
         kernels = kernels / kernels.sum((-2, -1), keepdim=True)
         if self.direct:
             return correlate(extend(share, self.window, self.border), kernels[:, None])
@@ -121,10 +123,10 @@ class Renderer:
             channels=weights.shape[0],
             direct=self.direct,
         )
-        if ways == "kernels" and spectra is not None:
-            return self._by_kernels(self._grouped(weights[:, None] * spectra), psfs)
-        if ways == "groups":
-            return self._by_groups(self._group_mixing(weights, spectra), psfs)
+        if ways != "bands":
+            planes_of = torch.eye(weights.shape[1]).to(weights) if spectra is None else spectra  # bands are planes too
+            mixing = self._grouped(weights[:, None] * planes_of)  # (C, K, G)
+            return self._by_kernels(mixing, psfs) if ways == "kernels" else self._by_groups(mixing, psfs)
         psfs = self._of_bands(psfs)
         count, kept = psfs.shape[0], None
         if self._keeps(count, psfs):
@@ -149,15 +151,6 @@ class Renderer:
             return torch.stack([convolution.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
 
         return blur
-
-    def _group_mixing(self, weights: Tensor, spectra: Tensor | None) -> Tensor:
-        """How much of each plane each channel gets through each PSF, (C, K, G)."""
-        count = self.psfs.shape[1]
-        owner = torch.arange(count) if self.owner is None else self.owner
-        of_group = (owner[:, None] == torch.arange(count)).to(weights)  # (L, G)
-        if spectra is None:
-            return weights[:, :, None] * of_group
-        return torch.einsum("cl,kl,lg->ckg", weights, spectra, of_group)
 
     def _by_groups(self, mixing: Tensor, psfs: Tensor) -> Callable[[Tensor], Tensor]:
         """sum_g h_g (sum_k M_ckg C_k): for few PSFs the planes are contracted, before the transform."""

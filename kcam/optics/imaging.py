@@ -333,13 +333,15 @@ class Imaging(Stage):
         vergences, _ = self._layers_of(scene, planes)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
+        grouped = self._psf_wavelengths(scene.wavelengths)
+        groups = len(grouped)
         rendering = rendering_work(
             (height, width),
             window,
             planes=count,
             factored=factored,
             bands=bands,
-            groups=len(self._psf_wavelengths(scene.wavelengths)),
+            groups=groups,
             channels=channels,
             border=self.border,
             direct=self.direct,
@@ -352,10 +354,7 @@ class Imaging(Stage):
         operations = {kind: number * layers * batch * scale for kind, number in rendering.operations.items()}
         operations["layer"] = float(layers)
         bank = 0.0
-        groups = 1
         if self.blur:
-            grouped = self._psf_wavelengths(scene.wavelengths)
-            groups = len(grouped)
             query = self._query(grouped, vergences, window, planes)
             row = choose(query, propagator=self.propagator, method=self.method)
             at_once = min(layers, self._layers_at_once(bands, window, planes))

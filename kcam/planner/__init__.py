@@ -1,7 +1,16 @@
 """The planner: simulate only the effects that a scene calls for, inside a tolerance, and say what was left out."""
 
-from kcam.planner.making import Planner, explain, make_plan, measured
-from kcam.planner.plan import Decision, OutOfRange, Plan, PlannedCamera, Range, noiseless_raw, relative_rms
+from kcam.planner.making import Planner, explain, make_plan, measured, timed
+from kcam.planner.plan import (
+    Decision,
+    OutOfRange,
+    Plan,
+    PlannedCamera,
+    Range,
+    noiseless_raw,
+    relative_rms,
+    with_imaging,
+)
 
 __all__ = [
     "Decision",
@@ -15,4 +24,6 @@ __all__ = [
     "measured",
     "noiseless_raw",
     "relative_rms",
+    "timed",
+    "with_imaging",
 ]

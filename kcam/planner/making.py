@@ -15,10 +15,9 @@ import torch
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Work
-from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw
+from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw, with_imaging
 from kcam.planner.trials import Trials
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
@@ -146,28 +145,23 @@ def explain(
     return dataclasses.replace(plan, measured=measured(plan, camera, scene)) if measure else plan
 
 
-def measured(
-    plan: Plan, camera: Camera, scene: Scene, *, rounds: int = 3, truth: torch.Tensor | None = None
-) -> dict[str, float]:
-    """True error of a plan, and the median times of the raw with it and without, new optics at each call [s].
-
-    truth: the noiseless raw of the camera without a plan, where it is known.
-    """
+def measured(plan: Plan, camera: Camera, scene: Scene, *, rounds: int = 3) -> dict[str, float]:
+    """True error of a plan, and the median times of the raw with it and without, by turns [s]."""
     found: dict[str, list[float]] = {"seconds": [], "reference_seconds": []}
-    error = plan.measure(camera, scene, truth=truth)
+    error = plan.measure(camera, scene)
     with torch.no_grad():
         for _ in range(rounds):
             for name, shot in (("seconds", plan.apply(camera)), ("reference_seconds", camera)):
-                raw = noiseless_raw(Camera(*(_forget(stage) for stage in shot), context=shot.context))
-                start = time.perf_counter()
-                raw(scene)
-                found[name].append(time.perf_counter() - start)
+                found[name].append(timed(shot, scene)[0])
     return {"error": error} | {name: statistics.median(times) for name, times in found.items()}
 
 
-def _forget(stage: Any) -> Any:
-    """An Imaging that has kept nothing from before."""
-    return stage.changed() if isinstance(stage, Imaging) else stage
+def timed(camera: Camera, scene: Scene) -> tuple[float, torch.Tensor]:
+    """Seconds of the noiseless raw with new optics, of which nothing is kept, and the raw."""
+    raw = noiseless_raw(with_imaging(camera))
+    start = time.perf_counter()
+    result = raw(scene)
+    return time.perf_counter() - start, result
 
 
 def _check_scenes(scenes: Sequence[Any], max_memory: float | None) -> None:

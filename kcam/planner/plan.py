@@ -216,6 +216,12 @@ def noiseless_raw(camera: Camera) -> Camera:
     return Camera(*stages[:end], context=camera.resolve()).noiseless()
 
 
+def with_imaging(camera: Camera, **arguments: Any) -> Camera:
+    """The camera with arguments of its Imaging changed, which has kept nothing; all else is shared."""
+    stages = [stage.changed(**arguments) if isinstance(stage, Imaging) else stage for stage in camera]
+    return Camera(*stages, context=camera.context)
+
+
 def relative_rms(a: Tensor, b: Tensor) -> float:
     """sqrt(mean (a - b)^2 / mean b^2): 0 for two black pictures, and without a bound for one."""
     a, b = a.detach().double(), b.detach().double()

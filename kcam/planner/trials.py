@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import Imaging
-from kcam.planner.plan import ENDS, noiseless_raw, relative_rms
+from kcam.planner.plan import ENDS, noiseless_raw, relative_rms, with_imaging
 from kcam.scene import Scene
 from kcam.sensor import ADC
 from kcam.sensor.noise import RandomStage
@@ -114,9 +114,7 @@ class Trials:
         changes = dict(changes)
         if changes.get("layers", 1) > 1:  # of the whole scene's range: as far apart in the sample's
             changes["layers"] = 1 + math.ceil((changes["layers"] - 1) * sample.depth_share)
-        stages: list[nn.Module] = list(self.raw_camera)
-        stages[self.index or 0] = self.imaging.changed(**changes)
-        return Camera(*stages, context=self.raw_camera.context)
+        return with_imaging(self.raw_camera, **changes)
 
     # ---- the stages of the sensor --------------------------------------------------------------------------------
 
