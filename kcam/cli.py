@@ -319,10 +319,11 @@ def tradeoff(
         light = open_scene(name, size=size)
         out.mkdir(parents=True, exist_ok=True)
         with progress("tradeoff") as advance:
-            result = module.sweep(
+            measured = module.sweep(
                 stages, light, thorough=thorough, advance=advance, title=f"{Path(camera).stem} on {Path(name).stem}"
             )
-        result.save(out / "tradeoff.json")
+        measured.save(out / "tradeoff.json")
+        result = module.Sweep.load(out / "tradeoff.json")  # the file rounds: what is shown is what stands there
         plots.save_figure(plots.tradeoff_figure(result), out / "tradeoff.png")
         Console(width=max(116, err.width)).print(result.table())
         typer.echo(f"\n{result.sentence()}\n\n{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}")
