@@ -237,6 +237,19 @@ def test_the_command_writes_both_files(tmp_path: Path, monkeypatch: pytest.Monke
         assert figure.width > 900
 
 
+def test_the_command_says_what_stands_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file keeps four digits: 465.46 ms is 465 ms as measured, and 465.5, so 466 ms, as written."""
+    rows = (
+        Row("default", "here", raw_rms=1e-4, seconds=0.3, default=True, pareto=True),
+        Row("k", "close", raw_rms=1e-6, seconds=0.46546, pareto=True),
+    )
+    monkeypatch.setattr(tradeoff, "sweep", lambda *_, **__: Sweep("t", "s", rows))
+    output = run("--scene", "star", "--size", 16, "--out", tmp_path)
+    sentence = Sweep.load(tmp_path / "tradeoff.json").sentence()
+    assert sentence != Sweep("t", "s", rows).sentence()
+    assert sentence in " ".join(output.split())
+
+
 def test_what_the_user_got_wrong_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert 'unknown scene "moon"' in run("--scene", "moon", "--out", tmp_path, status=2)
     assert "no optics.Imaging" in run("--camera", "ideal", "--out", tmp_path, status=2)
