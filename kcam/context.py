@@ -81,6 +81,10 @@ class Stage(nn.Module):
         """The arguments."""
         return arguments_text(self)
 
+    def output_channels(self, channels: int, context: Context | None = None) -> int:
+        """Channels of the result for so many of the input: for containers that must know them beforehand."""
+        return channels
+
     def provides(self) -> dict[str, Any]:
         """The `Context` fields that this stage determines for its neighbours (arguments left open are left out)."""
         return {}

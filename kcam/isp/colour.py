@@ -196,6 +196,10 @@ class ColourMatrix(Stage):
             matrix = as_shot_colour_matrix(context or Context(), channels=_channels(signal))
         return apply_colour_matrix(signal, matrix=matrix)
 
+    def output_channels(self, channels: int, context: Context | None = None) -> int:
+        """Red, green and blue."""
+        return 3
+
 
 def tone_curve(signal: Tensor) -> Tensor:
     """Linear sRGB to coded sRGB: clipped to 0..1, then the sRGB transfer function of IEC 61966-2-1.

@@ -467,6 +467,10 @@ class Demosaic(Stage):
         signal = signal - like(context.black_level, signal)
         return demosaic(signal, pattern=pattern, method=self.method, domain=self.domain, gains=gains)
 
+    def output_channels(self, channels: int, context: Context | None = None) -> int:
+        """The pattern's colours."""
+        return _channels(self.pattern or (context or Context()).pattern)
+
     def provides(self) -> dict[str, Any]:
         """The pattern, where it was given."""
         return {} if self.pattern is None else {"pattern": self.pattern}
@@ -527,6 +531,10 @@ class LearnedDemosaic(Stage):
         """(B,1,H,W) to (B,N,H,W)."""
         signal = signal - like((context or Context()).black_level, signal)
         return learned_demosaic(signal, weight=self.weight, bias=self.bias)
+
+    def output_channels(self, channels: int, context: Context | None = None) -> int:
+        """Those of the kernel."""
+        return self.weight.shape[0]
 
     def extra_repr(self) -> str:
         """The shape of the kernel."""

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kcam.optics import sampling
 from kcam.optics.elements import zernike_sum
+from kcam.optics.polar import legendre
 from kcam.optics.pupil import Pupil, disc_weights, grid_nodes, grid_spacing, unfold_quadrant
 from kcam.optics.transforms import MatrixTransform, pupil_intensity
 from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
+
+_STEP = math.pi / 24  # of t in the table of J0: |U|^2 by cubic interpolation is then good to 1e-4 of its fringes
+_PROFILE_STEPS = 16  # of the profile for each of its fringes; cubic between them
+_LARGEST_TABLE = 2**26  # entries, 512 MB
 
 
 def batch_psf(
@@ -27,11 +34,12 @@ def batch_psf(
 ) -> Tensor:
     """PSFs of a batch of ideal round lenses, each with its own defocus, aperture and aberrations.
 
-    W = V r^2 / 2 + sum_j c_j Z_j(r / a), the same at all wavelengths, propagated paraxially. No module is built per
-    sample: an augmentation draws these numbers and calls this once.
+    W = V r^2 / 2 + sum_j c_j Z_j(r / a), propagated paraxially; c_j is the same at all wavelengths. No module is built
+    per sample: an augmentation draws these numbers and calls this once.
 
     Args:
-        vergences: residual V, (B,) or (B, Z) [1/m]; 0 is in focus, 1/z - 1/z_focus for an object at z.
+        vergences: residual V, (B,), (B, Z), or (B, Z, L) where it depends on the wavelength, as the power of a lens of
+            glass does [1/m]; 0 is in focus, 1/z - 1/z_focus for an object at z.
         radii: semi-apertures a, (B,) [m], > 0.
         coefficients: (B, K) of Noll's Zernikes j = 1..K [m RMS], or None.
         wavelengths: (L,) [m]. sensor_distance: d, a number or (B,) [m]. pixel_pitch: [m]. shape: (H, W) pixels.
@@ -48,14 +56,22 @@ def batch_psf(
     check_positive(sensor_distance, name="sensor_distance")
     device = vergences.device
     residual = vergences.to(torch.float64)
-    residual = residual[:, None] if residual.ndim == 1 else residual  # (B, Z)
-    batch = residual.shape[0]
+    residual = residual[:, None] if residual.ndim == 1 else residual
+    residual = residual[..., None] if residual.ndim == 2 else residual  # (B, Z, 1 or L)
+    batch, layers = residual.shape[:2]
+    if residual.ndim != 3 or residual.shape[2] not in (1, grid.numel()):
+        raise ValueError(
+            f"vergences must be (B,), (B, Z) or (B, Z, {grid.numel()}), one per wavelength, got "
+            f"{tuple(vergences.shape)}."
+        )
     a = torch.as_tensor(radii, dtype=torch.float64, device=device).expand(batch)
     d = torch.as_tensor(sensor_distance, dtype=torch.float64, device=device).expand(batch)
     if coefficients is not None and (coefficients.ndim != 2 or coefficients.shape[0] != batch):
         raise ValueError(f"coefficients must be (B, K) with B = {batch}, got {tuple(coefficients.shape)}.")
     if batch == 0:
-        return residual.new_zeros(0, residual.shape[1], grid.numel(), *shape, dtype=dtype)
+        return residual.new_zeros(0, layers, grid.numel(), *shape, dtype=dtype)
+    if coefficients is None:
+        return _radial_bank(residual, a=a, d=d, grid=grid, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
 
     def zernikes(x: Tensor, y: Tensor) -> list[Tensor]:
         pupil = Pupil(x, y, torch.ones_like(a[0]), torch.ones_like(a[0]), paraxial=True)
@@ -63,10 +79,10 @@ def batch_psf(
         unit = torch.eye(count, dtype=torch.float64, device=device)
         return [pupil.rho2, *(zernike_sum(unit[j], pupil) for j in range(count))]
 
-    # OPD as coefficients of rho^2 and of the Zernikes, (B, Z, T)
-    opd = (residual * a[:, None] ** 2 / 2)[..., None]
+    # OPD as coefficients of rho^2 and of the Zernikes, (B, 1 or L, Z, T)
+    opd = (residual.transpose(1, 2) * a[:, None, None] ** 2 / 2)[..., None]
     if coefficients is not None:
-        own = coefficients.to(device, torch.float64)[:, None].expand(-1, residual.shape[1], -1)
+        own = coefficients.to(device, torch.float64)[:, None, None].expand(-1, opd.shape[1], layers, -1)
         opd = torch.cat([opd, own], dim=-1)
     with torch.no_grad():
         side = torch.linspace(-1, 1, 65, dtype=torch.float64, device=device)
@@ -75,7 +91,7 @@ def batch_psf(
         slopes = [
             (opd @ g.flatten(1)[:, inside]).square() for g in torch.gradient(coarse, spacing=2 / 64, dim=(-2, -1))
         ]
-        displacement = torch.stack(slopes).sum(0).sqrt().amax(dim=(1, 2)) * d / a
+        displacement = torch.stack(slopes).sum(0).sqrt().amax(dim=(1, 2, 3)) * d / a
         widest = a / d
         half_window = (max(shape) // 2 + sampling.WINDOW_MARGIN) * pixel_pitch
         shortest = float(grid.min())
@@ -106,7 +122,7 @@ def batch_psf(
     scales = (wavenumbers * (a / d)[:, None]).flatten()  # (B L,)
     like = torch.empty(0, dtype=dtype, device=device)
     intensity = pupil_intensity(
-        (wavenumbers[:, None, None] * opd[:, None]).flatten(0, 1).to(dtype),
+        (wavenumbers[:, None, None] * opd).flatten(0, 1).to(dtype),
         maps=maps.to(dtype),
         amplitude=weights[None].to(dtype),
         field=None,
@@ -122,3 +138,112 @@ def batch_psf(
     rows, columns = (sampling.pixel_box(n, per_pixel=per_pixel, reach=reach).to(like) for n in shape)
     images = (rows @ intensity @ columns.mT).unflatten(0, (batch, -1)) * factor[..., None, None, None].to(dtype)
     return images.transpose(1, 2)
+
+
+def _radial_bank(
+    residual: Tensor,
+    *,
+    a: Tensor,
+    d: Tensor,
+    grid: Tensor,
+    pixel_pitch: float,
+    shape: tuple[int, int],
+    dtype: torch.dtype,
+) -> Tensor:
+    """PSFs (B, Z, L, H, W) of round lenses with nothing but defocus, which need one Hankel transform each.
+
+    U(t) = 2 INT_0^1 exp(i k V a^2 rho^2 / 2) J0(t rho) rho d rho,   I(r) = pi a^2 / (lambda d)^2 |U(k a r / d)|^2
+
+    One table of J0 serves all lenses and wavelengths. What the profile I(r), cubic between steps of r, sends into each
+    pixel is a fixed sparse matrix: also one for all.
+    """
+    wavenumbers = (2 * math.pi / grid).to(residual.device)
+    scales = wavenumbers * (a / d)[:, None]  # (B, L): t per metre
+    half = max(shape) // 2
+    with torch.no_grad():
+        fastest = float(scales.max()) * pixel_pitch  # t per pixel
+        defocus = float((residual.abs().amax((1, 2)) * d * a * wavenumbers.max() * a / d).max())  # of the rim ray, in t
+        per_pixel = 2 ** max(3, math.ceil(math.log2(_PROFILE_STEPS * fastest / math.pi)))
+        corner = math.sqrt(2) * (half + 0.5)
+        table = _hankel_table(_rounded((fastest * corner + defocus) / 2 + 32), _rounded(fastest * corner / _STEP + 8))
+    rho, weights, bessel = (value.to(residual.device) for value in table)
+    phase = (wavenumbers[:, None] * residual.transpose(1, 2) * (a[:, None, None] ** 2 / 2))[..., None] * rho**2
+    amplitude = 2 * rho * weights  # (B, L, Z, n) below
+    re, im = ((wave * amplitude) @ bessel for wave in (phase.cos(), phase.sin()))
+    intensity = re.square() + im.square()  # (B, L, Z, T)
+    steps = torch.arange(math.ceil(corner * per_pixel) + 3, dtype=torch.float64, device=residual.device)
+    position = scales[..., None] * (steps * (pixel_pitch / per_pixel / _STEP))  # (B, L, R)
+    low = torch.clamp(position.detach().floor().long(), max=bessel.shape[1] - 3)
+    offset = position - low
+    profile = torch.zeros(())
+    for tap, weight in zip((-1, 0, 1, 2), _cubic(offset), strict=True):
+        index = (low + tap).abs()[:, :, None].expand(-1, -1, intensity.shape[2], -1)  # I is even in t
+        profile = profile + weight[:, :, None] * intensity.gather(-1, index)
+    factor = math.pi * (a[:, None] * pixel_pitch / (grid.to(residual.device) * d[:, None])) ** 2
+    profile = (profile * factor[..., None, None]).to(dtype)
+    octant = torch.sparse.mm(_ring_shares(half, per_pixel, dtype, residual.device), profile.flatten(0, 2).T)
+    rows, columns = (torch.arange(-(n // 2), n - n // 2, device=residual.device).abs() for n in shape)
+    near, far = torch.minimum(rows[:, None], columns), torch.maximum(rows[:, None], columns)
+    bank = octant[(far * (far + 1) // 2 + near).flatten()].T
+    return bank.view(*profile.shape[:3], *shape).transpose(1, 2)
+
+
+def _rounded(count: float) -> int:
+    """Up to one of four sizes per octave, so that a few tables serve all draws."""
+    step = 2 ** max(4, math.floor(math.log2(count)) - 2)
+    return int(step * math.ceil(count / step))
+
+
+@functools.lru_cache(maxsize=12)
+def _hankel_table(nodes: int, arguments: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Gauss-Legendre rho and weights (n,) on 0..1, and J0(t rho) (n, T) at t = 0, _STEP, ..."""
+    if nodes * arguments > _LARGEST_TABLE:
+        raise ValueError(
+            f"this batch needs a Hankel table of {nodes} x {arguments}, more than {_LARGEST_TABLE} numbers: the PSF is "
+            "thousands of fringes wide. Use a smaller shape, larger f-numbers or distances nearer to the focus."
+        )
+    points, weights = (torch.as_tensor(value) for value in legendre(nodes))
+    rho = (points + 1) / 2
+    t = torch.arange(arguments, dtype=torch.float64) * _STEP
+    return rho, weights / 2, torch.special.bessel_j0(rho[:, None] * t)
+
+
+def _cubic(offset):
+    """Weights of the Lagrange polynomial through -1, 0, 1, 2."""
+    x = offset
+    return (
+        -x * (x - 1) * (x - 2) / 6,
+        (x + 1) * (x - 1) * (x - 2) / 2,
+        -(x + 1) * x * (x - 2) / 2,
+        (x + 1) * x * (x - 1) / 6,
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def _ring_shares(half: int, per_pixel: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Integral over each pixel (far, near), 0 <= near <= far <= half, of a radial function, cubic between steps.
+
+    Returns:   sparse (pixels, R), pixel far (far + 1) / 2 + near; R steps of 1 / per_pixel pixels. Gauss-Legendre in
+    each pixel, exact for the fringes that the steps resolve.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(math.ceil(per_pixel * math.pi / (2 * _PROFILE_STEPS)) + 10)
+    area = np.outer(weights, weights).ravel() / 4
+    rings = math.ceil(math.sqrt(2) * (half + 0.5) * per_pixel) + 3
+    pixels, columns, values = [], [], []
+    for far in range(half + 1):
+        x = (far + nodes / 2) ** 2
+        for near in range(far + 1):
+            r = np.sqrt(x[:, None] + (near + nodes / 2) ** 2).ravel() * per_pixel
+            low = r.astype(np.int64)
+            first = low.min() - 1
+            width = low.max() + 2 - first + 1
+            share = np.zeros(width)
+            for tap, weight in zip((-1, 0, 1, 2), _cubic(r - low), strict=True):
+                share += np.bincount(low + tap - first, weights=weight * area, minlength=width)
+            pixels.append(np.full(width, far * (far + 1) // 2 + near))
+            columns.append(np.abs(np.arange(first, first + width)))  # even in r
+            values.append(share)
+    index = torch.as_tensor(np.stack([np.concatenate(pixels), np.concatenate(columns)]))
+    shape = ((half + 1) * (half + 2) // 2, rings)
+    found = torch.sparse_coo_tensor(index, torch.as_tensor(np.concatenate(values)), shape, check_invariants=False)
+    return found.coalesce().to(device=device, dtype=dtype)

@@ -290,16 +290,6 @@ class Imaging(Stage):
         pixel = (self.pixel_pitch, self.fill_factor)
         return (fingerprint(self.lens), how, pixel, wavelengths, vergences, shape, str(like.dtype), str(like.device))
 
-    def _layer_shares(self, depth: Tensor, vergences: Tensor) -> Tensor:
-        """Share of each pixel in each layer, linear in vergence between neighbours or all in the nearest: (B, Z, H, W),
-        sums to 1.
-        """
-        first, second = vergences[:2].to(depth.device)
-        position = (1 / depth - first) / (second - first)
-        position = position if self.interpolate else position.round()
-        layers = torch.arange(vergences.numel(), device=depth.device, dtype=torch.float64)
-        return torch.clamp(1 - (position - layers[:, None, None]).abs(), min=0)
-
     def _working(self, planes: Tensor) -> Tensor:
         """In the type that is computed in: at least float32."""
         if self.precision is not None:
@@ -312,7 +302,7 @@ class Imaging(Stage):
         vergences = self.depth_layers(depth, scene.wavelengths)
         if vergences.numel() == 1:
             return vergences, None
-        shares = self._layer_shares(depth, vergences).to(planes)
+        shares = layer_shares(1 / depth, vergences, interpolate=self.interpolate).to(planes)
         present = (shares.flatten(2).amax(dim=(0, 2)) > 0).cpu()
         return vergences[present], shares[:, present.to(shares.device)]
 
@@ -379,7 +369,7 @@ class Imaging(Stage):
         vergences, shares = self._layers_of(scene, planes)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         length = self._layers_at_once(bands, window, planes)
-        layers = _Layers(planes, shares, occlusion=self.occlusion)
+        layers = Layers(planes, shares, occlusion=self.occlusion)
         for start in range(0, vergences.numel(), length):
             some = vergences[start : start + length]
             psfs = self._grouped_bank(scene.wavelengths, vergences=some, shape=window, like=planes)
@@ -408,7 +398,20 @@ def _map_work(query: Query) -> float:
     return float(sum(pixels + (0 if query.paraxial else 3 * count**2) for count in counts))
 
 
-class _Layers:
+def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
+    """Share of each pixel in each layer of a map: linear between neighbours, or all in the nearest.
+
+    Args:      vergence: (B, 1, H, W) [1/m]. layers: (Z,) in equal steps, ascending, Z > 1 [1/m].
+    Returns:   (B, Z, H, W), sums to 1 over the layers.
+    """
+    first, second = layers[:2].to(vergence.device)
+    position = (vergence - first) / (second - first)
+    position = position if interpolate else position.round()
+    index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
+    return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
+
+
+class Layers:
     """Depth layers from far to near: each is blurred with its own coverage and laid over what is behind it.
 
     E_k = K_k * sum_(j <= k) m_j,   l_k = (h_k * m_k I) / E_k,   a_k = (K_k * m_k) / E_k,   out <- l_k + (1 - a_k) out
@@ -421,7 +424,7 @@ class _Layers:
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
     """
 
-    def __init__(self, planes: Tensor, shares: Tensor | None, *, occlusion: bool) -> None:
+    def __init__(self, planes: Tensor, shares: Tensor | None, *, occlusion: bool = True) -> None:
         self.planes, self.shares, self.occlusion = planes, shares, occlusion
         self.light: Tensor = planes.new_zeros(())
         self._unhidden = planes.new_zeros(())  # pixels that lie in the layers so far

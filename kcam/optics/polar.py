@@ -92,7 +92,7 @@ def ring_nodes(query: Query, count: int) -> tuple[Tensor, Tensor]:
             f"this PSF needs {count} rings of the pupil, more than {_MOST_RINGS}: rays at the rim of the lens are sent "
             "too far beyond the window. Use a smaller aperture or a larger radius of curvature."
         )
-    nodes, weights = (torch.as_tensor(v, device=query.device) for v in _legendre(count))
+    nodes, weights = (torch.as_tensor(v, device=query.device) for v in legendre(count))
     discs = query.lens.aperture.discs()
     inner = torch.zeros_like(query.tau) + (discs[1][0] if len(discs) > 1 else 0.0)
     if len(discs) > 1:
@@ -101,7 +101,7 @@ def ring_nodes(query: Query, count: int) -> tuple[Tensor, Tensor]:
 
 
 @functools.lru_cache(maxsize=16)
-def _legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+def legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre nodes and weights on [-1, 1]: one rule, or panels of one rule that together resolve as much."""
     panels = math.ceil(count / _PANEL)
     order = count if panels == 1 else math.ceil(count / panels) + 32

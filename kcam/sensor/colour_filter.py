@@ -295,6 +295,10 @@ class ColourFilter(Stage):
         with full_precision(signal.device):
             return self.finish(torch.einsum("kl,...lhw->...khw", weights, signal))
 
+    def output_channels(self, channels: int, context: Context | None = None) -> int:
+        """Its curves, or the one plane of a tile."""
+        return 1 if self.is_tile else self.coefficients.shape[0]
+
     def provides(self) -> dict[str, ColourFilter]:
         """Itself, for exposure, white balance and colour matrix."""
         return {"colour_filter": self}

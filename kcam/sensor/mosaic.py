@@ -85,6 +85,10 @@ class Mosaic(Stage):
         """(B,C,H,W) to (B,1,H,W): see `mosaic`."""
         return mosaic(signal, pattern=self.pattern)
 
+    def output_channels(self, channels: int, context: Context | None = None) -> int:
+        """One plane."""
+        return 1
+
     def provides(self) -> dict[str, str]:
         """The pattern, for the demosaic."""
         return {"pattern": self.pattern}

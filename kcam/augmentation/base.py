@@ -1,0 +1,137 @@
+"""What all camera augmentations share: pictures in linear light, work for drawn rows only, noise from seeds.
+
+A tensor of 3 channels (or 1, gray) is a *picture*: sRGB, coded, in [0,1]. It is taken to linear light, and back, where
+the physics needs it; the result lies in [0,1]. Any other number of channels is a *cube*: spectral bands of linear light
+on which a perfect white is 1, from 420 to 720 nm in equal steps unless `wavelengths` says otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import kornia.augmentation as K
+import torch
+from kornia.color import rgb_to_linear_rgb
+from torch import Tensor
+
+from kcam.augmentation.draws import Draw, Draws
+from kcam.isp import tone_curve
+from kcam.precision import full_precision
+from kcam.units import nm, wavelength_grid
+
+RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
+"""Dominant wavelengths of the primaries of sRGB, seen against its white (from CIE 1931 chromaticities)."""
+
+
+def is_picture(signal: Tensor) -> bool:
+    """Whether a tensor (..., C, H, W) is a coded picture rather than a cube of linear light."""
+    return signal.shape[-3] in (1, 3)
+
+
+def to_light(picture: Tensor) -> Tensor:
+    """Coded sRGB (..., 1 or 3, H, W) to linear light; the slope is finite everywhere."""
+    channels = picture.shape[-3]
+    linear = rgb_to_linear_rgb(picture.expand(*picture.shape[:-3], 3, -1, -1))
+    return linear[..., :channels, :, :]
+
+
+def wavelengths_of(signal: Tensor, given: Tensor | None) -> Tensor:
+    """Wavelength of each channel (C,) float64 [m]: those given, the primaries of a picture, or the bands of a cube."""
+    channels = signal.shape[-3]
+    if given is not None:
+        if len(given) != channels:
+            raise ValueError(
+                f"{len(given)} wavelengths do not fit {channels} channels; pass one for each channel, in metres."
+            )
+        return given
+    if channels == 3:
+        return wavelength_grid(list(RGB_WAVELENGTHS))
+    return wavelength_grid([RGB_WAVELENGTHS[1]]) if channels == 1 else wavelength_grid(count=channels)
+
+
+def each_generator(seeds: Tensor, device: torch.device) -> Iterator[torch.Generator | None]:
+    """A generator for each sample; under torch.compile, which cannot hold one, torch's own."""
+    for seed in seeds.unbind():
+        if torch.compiler.is_compiling():
+            yield None
+        else:
+            yield torch.Generator(device).manual_seed(int(seed))
+
+
+def per_sample(values: Tensor, signal: Tensor) -> Tensor:
+    """(B,) in the type of a signal (B,C,H,W), to be multiplied with it."""
+    return values.to(signal)[:, None, None, None]
+
+
+class CameraAugmentation(K.IntensityAugmentationBase2D):
+    """Base of the augmentations that keep the pixel grid. A subclass computes in `simulate`.
+
+    Kornia transforms all rows and then throws away those that were not drawn; here they cost nothing. Half precision
+    is computed in float32, outside of autocast, and given back as it came. An empty batch gives an empty one.
+    """
+
+    in_light = True
+    """Whether `simulate` wants pictures in linear light."""
+
+    def __init__(
+        self, draws: Mapping[str, Draw], *, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False
+    ) -> None:
+        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
+        self._param_generator: Draws = Draws(draws)
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """The bounds that a number is drawn between."""
+        return self._param_generator.bounds(name)
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """The effect on (B,C,H,W), B > 0, float32 or float64, with what was drawn for these rows."""
+        raise NotImplementedError(f"{type(self).__name__} does not say what it does.")
+
+    def output_channels(self, channels: int) -> int:
+        """Channels of the result for so many of the input."""
+        return channels
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Any], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Kornia's hook: the rows that were drawn through `simulate`."""
+        return self.on_drawn_rows(input, params, self._simulated)
+
+    def on_drawn_rows(
+        self, input: Tensor, params: dict[str, Any], function: Callable[[Tensor, dict[str, Tensor]], Tensor]
+    ) -> Tensor:
+        """`function` of the rows that were drawn; the others as they are."""
+        drawn = self._drawn(params)
+        if input.shape[0] == 0 or input.numel() == 0:
+            shape = (input.shape[0], self.output_channels(input.shape[1]), *input.shape[2:])
+            return input.new_zeros(shape) + input.sum()
+        gate = torch.atleast_1d(params["batch_prob"] > 0.5)
+        if torch.compiler.is_compiling() or self.p == 1 or bool(gate.all()):
+            return function(input, drawn)
+        rows = gate.nonzero().flatten()
+        if rows.numel() == 0:
+            return input
+        result = function(input[rows.to(input.device)], {name: value[rows] for name, value in drawn.items()})
+        if result.shape[1:] != input.shape[1:]:
+            raise ValueError(
+                f"{type(self).__name__} turns {input.shape[1]} channels into {result.shape[1]}, which only some rows "
+                f"of a batch cannot have. Use p=1.0, not p={self.p:g}."
+            )
+        return input.index_copy(0, rows.to(input.device), result)
+
+    def _drawn(self, params: dict[str, Any]) -> dict[str, Tensor]:
+        """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""
+        drawn = {name: params[name] for name in self._param_generator.draws}
+        if "noise_seed" in drawn and "video_batch_size" in params:
+            rows = drawn["noise_seed"].shape[0]
+            frames = rows // max(1, int(params["video_batch_size"]))
+            drawn["noise_seed"] = drawn["noise_seed"] + torch.arange(rows) % max(1, frames)
+        return drawn | {name: params[name] for name in ("inverse_depth",) if name in params}
+
+    def _simulated(self, input: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        working = input if input.dtype in (torch.float32, torch.float64) else input.float()
+        with full_precision(input.device):
+            coded = self.in_light and is_picture(working)
+            result = self.simulate(to_light(working) if coded else working, drawn)
+            return (tone_curve(result) if coded else result).to(input.dtype)

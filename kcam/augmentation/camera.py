@@ -1,0 +1,143 @@
+"""A whole random camera: a picture or a cube, photographed again by one of several cameras."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, wavelengths_of
+from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
+from kcam.augmentation.optics import check_inverse_depth
+from kcam.augmentation.sensor import announced
+from kcam.camera import PRESETS, Camera
+from kcam.scene import Scene
+from kcam.ste import clip_ste
+from kcam.units import wavelength_grid
+
+_NEAREST_VERGENCE = 1e-9  # 1/m: a map's 0 is infinity
+_SCENE = "coffee"  # what is planned for: detail of all sizes, saturated colours
+
+
+class RandomCamera(CameraAugmentation):
+    """Photograph each sample with a camera drawn from several: optics, filter, noise, ADC, demosaic and tone.
+
+    A picture counts as a scene whose paints have its colours (`Scene.from_rgb`), a cube as spectral radiance in
+    daylight (`Scene.from_bands`); both become pictures. A map of inverse depth, from `CameraSequential` or as
+    ``augment(image, inverse_depth=map)`` (B,1,H,W) [1/m], takes the place of the drawn distance.
+
+    Each camera is planned once for each size of picture, on a fixed scene at both ends of the range of distances, never
+    for a batch: the result for a sample does not depend on the others.
+
+    Args:      cameras: presets by name, files that `Camera.save` wrote, or cameras. Presets and files are not trained;
+                   a camera of one's own keeps its parameters, and gradients reach them.
+               tolerance: of the plan, see `kcam.planner.make_plan`; 0 for the reference physics.
+               distance: of the picture [m], uniform in 1/m.
+               wavelengths: of a cube's bands [m].
+    Raises:    ValueError for no cameras, an unknown preset, cameras that do not end in three channels, a bad tolerance;
+        at the call, where the channels change, for p < 1.
+    """
+
+    in_light = False
+    takes_depth = True
+
+    def __init__(
+        self,
+        cameras: Sequence[str | os.PathLike[str] | Camera] = ("phone",),
+        tolerance: float | str = 0.02,
+        *,
+        distance: Bounds = (0.5, 5.0),
+        wavelengths: Tensor | list[float] | None = None,
+        same_on_batch: bool = False,
+        p: float = 1.0,
+        keepdim: bool = False,
+    ) -> None:
+        if isinstance(cameras, (str, os.PathLike, Camera)):
+            cameras = [cameras]
+        if not cameras:
+            raise ValueError('cameras is empty: give at least one, such as cameras=["phone"].')
+        draws: dict[str, Draw] = {
+            "camera": Choice(len(cameras)),
+            "distance": Uniform(distance, "vergence", least=1e-2, unit="[m]"),
+            "noise_seed": Seed(),
+        }
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        self.cameras = nn.ModuleList(_opened(camera) for camera in cameras)
+        self.tolerance = tolerance
+        names = (type(camera).__name__ if isinstance(camera, Camera) else str(camera) for camera in cameras)
+        self.flags = {"cameras": "/".join(names), "tolerance": tolerance}
+        self.wavelengths = None if wavelengths is None else wavelength_grid(wavelengths)
+        self._planned: dict[tuple[Any, ...], Camera] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Plans are made again after a copy: they refer to the cameras of the original."""
+        return {**super().__getstate__(), "_planned": {}}
+
+    def output_channels(self, channels: int) -> int:
+        """A picture of three channels."""
+        return 3
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """What is drawn, and for Kornia's containers the shape of the picture."""
+        return super().generate_parameters(batch_shape) | announced(self, batch_shape)
+
+    def planned(self, index: int, signal: Tensor, *, depth: bool = False) -> Camera:
+        """The camera that photographs such signals: with its plan for their size, made when it is first asked for."""
+        shape, bands = (signal.shape[-2], signal.shape[-1]), None if is_picture(signal) else self._bands(signal)
+        key = (index, shape, depth, None if bands is None else tuple(bands.tolist()))
+        if key not in self._planned:
+            camera: Any = self.cameras[index]
+            scene = Scene.builtin(_SCENE, shape, wavelengths=bands).to(device=signal.device)
+            near, far = (1 / bound for bound in self.bounds("distance"))
+            if depth:
+                ramp = torch.linspace(far, near, shape[1], dtype=torch.float64).clamp(min=_NEAREST_VERGENCE)
+                scenes = [scene.with_depth((1 / ramp).expand(1, 1, *shape).to(signal.device))]
+            else:
+                scenes = [scene.with_depth(1 / max(end, _NEAREST_VERGENCE)) for end in {near, far}]
+            plan = camera.plan(scenes, tolerance=self.tolerance)
+            # a plain camera: a PlannedCamera would warn of each picture that is not like the fixed scene
+            self._planned[key] = Camera(*plan.apply(camera), context=camera.resolve())
+        return self._planned[key]
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Row by row, each with its own camera, distance and seed."""
+        depths: Sequence[float | Tensor] = drawn["distance"].tolist()
+        mapped = "inverse_depth" in drawn
+        if mapped:
+            vergence = check_inverse_depth(drawn["inverse_depth"], signal).double().clamp(min=_NEAREST_VERGENCE)
+            depths = (1 / vergence).split(1)
+        generators = each_generator(drawn["noise_seed"], signal.device)
+        pictures = []
+        for row, index, depth, generator in zip(
+            signal.split(1), drawn["camera"].tolist(), depths, generators, strict=True
+        ):
+            picture = self.planned(index, signal, depth=mapped)(self._scene(row, depth), generator=generator)
+            if picture.shape[1] != 3:
+                raise ValueError(
+                    f"camera {index} of RandomCamera ends in {picture.shape[1]} channels, expected a picture of 3. Add "
+                    "isp.Demosaic(), isp.ColourMatrix() and isp.ToneCurve()."
+                )
+            pictures.append(picture)
+        return torch.cat(pictures)
+
+    def _bands(self, signal: Tensor) -> Tensor:
+        return wavelengths_of(signal, self.wavelengths)
+
+    def _scene(self, row: Tensor, depth: float | Tensor) -> Scene:
+        if is_picture(row):
+            return Scene.from_rgb(clip_ste(row, 0.0, 1.0), depth=depth)
+        return Scene.from_bands(clip_ste(row, 0.0, None), wavelengths=self._bands(row), depth=depth)
+
+
+def _opened(camera: str | os.PathLike[str] | Camera) -> Camera:
+    if isinstance(camera, Camera):
+        return camera
+    if str(camera) in PRESETS:
+        return Camera.preset(str(camera)).requires_grad_(False)
+    if Path(camera).suffix:
+        return Camera.load(camera).requires_grad_(False)
+    raise ValueError(f"unknown camera {str(camera)!r}. There are: {', '.join(PRESETS)}; or give a .safetensors file.")

@@ -1,0 +1,188 @@
+"""Lens distortion, which moves pixels: masks, boxes and keypoints go with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import kornia.augmentation as K
+import torch
+from kornia.constants import Resample
+from kornia.core.ops import eye_like
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.calibration import distort_points, undistort_points
+from kornia.geometry.keypoints import Keypoints
+from kornia.geometry.transform import remap
+from torch import Tensor
+
+from kcam.augmentation.draws import Bounds, Draws, Uniform
+from kcam.precision import full_precision
+
+_ITERATIONS = 40  # of the inverse, a fixed point, at most
+_TOLERANCE = 0.01  # of the inverse at the picture's border, where it converges last [pixels]
+_EDGE_SAMPLES = 9  # of a box's edge: a straight edge becomes a curve
+
+
+class RandomLensDistortion(K.GeometricAugmentationBase2D):
+    """Barrel and pincushion distortion: the Brown-Conrady model, with OpenCV's coefficients.
+
+    x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),   y_d = y (1 + ...) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+    with (x, y) the position from the picture's centre in units of `focal_length` times its longer side. What an ideal
+    lens images at (x, y) this one images at (x_d, y_d). Masks are taken from the nearest pixel; keypoints move exactly;
+    a box becomes the box around its moved edges. Beyond the picture it is black, and masks are 0.
+
+    Args:      k1: below 0 barrel, above 0 pincushion. k2: its next term. p1, p2: decentring.
+               focal_length: of the lens in units of the picture's longer side; 1 is a field of 53 degrees.
+               resample: of the picture, "bilinear" or "nearest".
+    Raises:    ValueError at the call where the drawn coefficients fold the picture over itself, or nearly so (the
+        inverse does not converge to 0.01 pixels at the border).
+    Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
+    """
+
+    def __init__(
+        self,
+        k1: Bounds = (-0.2, 0.2),
+        k2: Bounds = 0.0,
+        p1: Bounds = 0.0,
+        p2: Bounds = 0.0,
+        *,
+        focal_length: float = 1.0,
+        resample: str = "bilinear",
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
+        if not focal_length > 0:
+            raise ValueError(f"focal_length must be > 0 of the picture's longer side, got {focal_length:g}.")
+        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+        draws = {name: Uniform(bounds, least=-10.0, most=10.0) for name, bounds in values.items()}
+        self._param_generator: Draws = Draws(draws)
+        self.flags = {"resample": Resample.get(resample), "align_corners": True, "focal_length": focal_length}
+        self.focal_length = focal_length
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """What is drawn, refused where it folds the picture."""
+        drawn = super().generate_parameters(batch_shape)
+        height, width = batch_shape[-2:]
+        if batch_shape[0] and not torch.compiler.is_compiling():
+            with torch.no_grad():
+                camera, coefficients = self._lens(drawn, (height, width), torch.device("cpu"))
+                border = _border((height, width)).expand(len(coefficients), -1, -1)
+                ideal = undistort_points(border, camera, coefficients, num_iters=_ITERATIONS)
+                missed = (distort_points(ideal, camera, coefficients) - border).abs().amax((1, 2))
+            bad = ~(missed < _TOLERANCE)
+            if bad.any():
+                k1, k2, p1, p2 = coefficients[bad][0].tolist()
+                raise ValueError(
+                    f"k1 = {k1:.3g}, k2 = {k2:.3g}, p1 = {p1:.3g}, p2 = {p2:.3g} fold the picture over itself, or "
+                    f"nearly so: its border has no one point that is imaged there. Use coefficients of half the size, "
+                    f"or focal_length={1.5 * self.focal_length:.3g}."
+                )
+        return drawn
+
+    def compute_transformation(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any]) -> Tensor:
+        """No matrix can say what happens; Kornia's is the identity."""
+        return eye_like(3, input)
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
+        if self.p == 1 or torch.compiler.is_compiling() or "batch_prob" not in params:
+            return self._remapped(input, params, flags, inverse=False)
+        rows = torch.atleast_1d(params["batch_prob"] > 0.5).nonzero().flatten()
+        drawn = {name: value[rows] if name in self._param_generator.draws else value for name, value in params.items()}
+        here = rows.to(input.device)
+        return input.index_copy(0, here, self._remapped(input[here], drawn, flags, inverse=False))
+
+    def inverse_inputs(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None, **kwargs
+    ) -> Tensor:
+        """The picture of the ideal lens again, but for what was resampled twice or lay outside."""
+        picture = self.transform_tensor(input)
+        gate = self._gate(params).to(picture.device)[:, None, None, None]
+        return torch.where(gate, self._remapped(picture, params, flags | kwargs, inverse=True), picture)
+
+    def apply_transform_keypoint(
+        self, input: Keypoints, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Keypoints:
+        """Each point to where the lens images it."""
+        output = input.clone()
+        output._data = self._moved(input.data, params).to(input.data.dtype)
+        return output
+
+    def apply_transform_box(
+        self, input: Boxes, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Boxes:
+        """The upright box around the moved edges."""
+        corners = input.data  # (B, N, 4, 2) in turn around the box
+        share = torch.linspace(0, 1, _EDGE_SAMPLES, dtype=corners.dtype, device=corners.device)[:, None]
+        edges = corners[..., None, :] + (corners.roll(-1, dims=-2) - corners)[..., None, :] * share
+        moved = self._moved(edges.flatten(1, -2), params).to(corners.dtype).view(*edges.shape[:2], -1, 2)
+        (left, top), (right, bottom) = moved.amin(-2).unbind(-1), moved.amax(-2).unbind(-1)
+        output = input.clone()
+        output._data = torch.stack(
+            [torch.stack(point, -1) for point in ((left, top), (right, top), (right, bottom), (left, bottom))], dim=-2
+        )
+        return output
+
+    def _lens(self, params: dict[str, Tensor], shape: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+        """Camera matrices (B,3,3) and coefficients (B,4), float64."""
+        height, width = shape
+        coefficients = torch.stack([params[name].double().to(device) for name in ("k1", "k2", "p1", "p2")], dim=1)
+        focal = self.focal_length * max(height, width)
+        camera = torch.tensor(
+            [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]], dtype=torch.float64
+        )
+        return camera.to(device).expand(len(coefficients), 3, 3), coefficients
+
+    def _moved(self, points: Tensor, params: dict[str, Tensor]) -> Tensor:
+        """Points (B, ..., 2) in pixels to where the lens images them."""
+        if points.numel() == 0:
+            return points
+        height, width = params["forward_input_shape"][-2:].tolist()
+        camera, coefficients = self._lens(params, (height, width), points.device)
+        flat = points.double().flatten(1, -2)
+        return distort_points(flat, camera, coefficients).view(points.shape)
+
+    def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:
+        if input.numel() == 0:
+            return input
+        working = input if input.dtype in (torch.float32, torch.float64) else input.float()
+        batch, _, height, width = working.shape
+        camera, coefficients = self._lens(params, (height, width), working.device)
+        compiling = torch.compiler.is_compiling()
+        iterations = _ITERATIONS if compiling else _iterations((height, width), camera, coefficients)
+        camera, coefficients = camera.to(working), coefficients.to(working)
+        y, x = (torch.arange(n, dtype=working.dtype, device=working.device) for n in (height, width))
+        grid = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1).reshape(1, -1, 2)
+        grid = grid.expand(batch, -1, -1)
+        with full_precision(working.device):
+            if inverse:
+                found = distort_points(grid, camera, coefficients)
+            else:
+                found = undistort_points(grid, camera, coefficients, num_iters=iterations)
+            source = found.view(batch, height, width, 2)
+            mode = Resample.get(flags.get("resample", Resample.BILINEAR)).name.lower()
+            moved = remap(working, source[..., 0], source[..., 1], mode=mode, align_corners=True)
+        return moved.to(input.dtype)
+
+
+@torch.no_grad()
+def _iterations(shape: tuple[int, int], camera: Tensor, coefficients: Tensor) -> int:
+    """Of the inverse, until the picture's border, where it converges last, is good to 1e-4 pixels."""
+    border = _border(shape).to(camera.device).expand(len(coefficients), -1, -1)
+    last = border
+    for count in range(4, _ITERATIONS, 4):
+        here = undistort_points(border, camera, coefficients, num_iters=count)
+        if float((here - last).abs().max()) < 1e-4:
+            return count
+        last = here
+    return _ITERATIONS
+
+
+def _border(shape: tuple[int, int]) -> Tensor:
+    """Corners and middles of a picture's sides, (9, 2) as x, y."""
+    height, width = shape
+    return torch.cartesian_prod(*(torch.linspace(0, n - 1, 3, dtype=torch.float64) for n in (width, height)))

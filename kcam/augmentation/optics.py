@@ -1,0 +1,487 @@
+"""Wave optics: defocus, diffraction, aberrations and colour fringes by PSFs that are drawn per sample; vignetting."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from kcam.augmentation.base import CameraAugmentation, per_sample, wavelengths_of
+from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
+from kcam.optics import batch_psf, refractive_index
+from kcam.optics.convolution import Convolution, Renderer
+from kcam.optics.imaging import Layers, layer_shares
+from kcam.units import check_length, check_pixel_pitch, mm, nm, um, wavelength_grid
+
+DESIGN = 550 * nm
+"""Where aberrations are stated, and where a lens is in focus."""
+FOCAL_LENGTH, PIXEL_PITCH = 8 * mm, 4 * um
+"""Of a machine-vision camera; a phone has 4.3 mm and 1.4 um, a full-frame camera 50 mm and 6 um."""
+FOCAL_LENGTH_RANGE = (1e-4, 10.0)
+
+
+class RandomBlur(CameraAugmentation):
+    """Base of the augmentations that convolve each sample with PSFs of its own: a round thin lens, drawn per sample.
+
+    The PSFs come from `optics.batch_psf` (paraxial, integrated over the pixels): the same as `optics.Imaging` of such a
+    lens with propagator="fresnel", the same psf_shape, and renormalise=True.
+
+    Args:      pixel_pitch: [m]. outside: share of the light that the window of a PSF may leave out, which is then
+                   spread over the window; smaller is slower. wavelengths: of the channels [m]; None: see `base`.
+    """
+
+    def __init__(
+        self,
+        draws: dict[str, Draw],
+        *,
+        pixel_pitch: float,
+        outside: float,
+        wavelengths: Tensor | list[float] | None,
+        same_on_batch: bool,
+        p: float,
+        keepdim: bool,
+    ) -> None:
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        if not 1e-4 <= outside < 1:
+            raise ValueError(f"outside must be a share of the light from 1e-4 to below 1, got {outside:g}.")
+        self.pixel_pitch, self.outside = check_pixel_pitch(pixel_pitch), outside
+        self.flags = {"pixel_pitch": self.pixel_pitch, "outside": outside}
+        self.wavelengths = None if wavelengths is None else wavelength_grid(wavelengths)
+
+    def psf_shape(self, picture: tuple[int, int], wavelengths: Tensor) -> tuple[int, int]:
+        """Window of the PSFs [pixels], for the worst that the ranges hold, so that it does not depend on the batch."""
+        half = math.ceil(self.widest(wavelengths) / self.pixel_pitch)
+        height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
+        return height, width
+
+    def tail(self, *, radius: float, sensor_distance: float, wavelengths: Tensor) -> float:
+        """Radius beyond which diffraction at a round aperture sends `outside` of the light: lambda d / (pi^2 a s)."""
+        return float(wavelengths.max()) * sensor_distance / (math.pi**2 * radius * self.outside)
+
+    def widest(self, wavelengths: Tensor) -> float:
+        """Half width of the largest PSF in the ranges [m]."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how large its PSFs are.")
+
+    def psfs(self, drawn: dict[str, Tensor], *, wavelengths: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
+        """(B, Z, L, h, w), each of sum 1."""
+        raise NotImplementedError(f"{type(self).__name__} does not say what its PSFs are.")
+
+    def bank(self, vergences: Tensor, *, shape: tuple[int, int], like: Tensor, **lens) -> Tensor:
+        """`batch_psf` with the light outside the window spread over it."""
+        psfs = batch_psf(vergences, pixel_pitch=self.pixel_pitch, shape=shape, dtype=like.dtype, **lens).to(like.device)
+        return psfs / psfs.sum((-2, -1), keepdim=True)
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """One depth: each channel of each sample with its PSF."""
+        wavelengths = wavelengths_of(signal, self.wavelengths)
+        shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
+        psfs = self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
+        return convolve(signal, psfs[:, 0])
+
+
+def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
+    """Each channel of each picture (B,C,H,W) with its own PSF (B,C,h,w), upright; beyond the border it is reflected."""
+    picture, window = (signal.shape[-2], signal.shape[-1]), (psfs.shape[-2], psfs.shape[-1])
+    sizes = Convolution.of(picture, window, border="reflect", itemsize=signal.element_size(), max_memory=2e9)
+    return sizes.back(sizes.transform(signal) * sizes.transfer(psfs))
+
+
+class RandomDefocus(RandomBlur):
+    """Defocus by wave optics: a thin lens focused at one distance, the picture at another, or at those of a depth map.
+
+    W = V r^2 / 2,   V = 1 / distance - 1 / focus,   sensor at d = 1 / (1 / f - 1 / focus), aperture f / N
+
+    With a map of inverse depth the picture is cut into `layers` layers, equally far apart in vergence, blurred and laid
+    over each other from far to near, as `optics.Imaging` does. Such a map comes from `CameraSequential`, or as
+    ``augment(image, inverse_depth=map)``, (B,1,H,W) [1/m], 0 at infinity.
+
+    Args:      focus: distance in focus [m]. f_number: N. distance: of the picture without a map [m]. Distances are
+                   drawn uniformly in 1/m, inf allowed.
+               focal_length: f [m]. pixel_pitch: [m]. By default a machine-vision camera, 8 mm with 4 um pixels.
+               layers: of a depth map.
+               Others: as for `RandomBlur`.
+    Raises:    ValueError for bounds out of range, a focus inside the focal length; at the call for a map of another
+        shape or below 0.
+    Valid      where `batch_psf` is: paraxial, 1 % where a^4 / (8 d^3 lambda) is below 0.005 waves.
+    """
+
+    takes_depth = True
+
+    def __init__(
+        self,
+        focus: Bounds = (0.5, 5.0),
+        f_number: Bounds = (1.8, 8.0),
+        *,
+        distance: Bounds = (0.5, 5.0),
+        focal_length: Bounds = FOCAL_LENGTH,
+        pixel_pitch: float = PIXEL_PITCH,
+        layers: int = 8,
+        outside: float = 0.01,
+        wavelengths: Tensor | list[float] | None = None,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        draws: dict[str, Draw] = {
+            "focus": Uniform(focus, "vergence", least=1e-3, unit="[m]"),
+            "f_number": Uniform(f_number, "log", least=0.5, most=200.0),
+            "distance": Uniform(distance, "vergence", least=1e-3, unit="[m]"),
+            "focal_length": Uniform(focal_length, least=1e-4, most=10.0, unit="[m]"),
+        }
+        super().__init__(
+            draws,
+            pixel_pitch=pixel_pitch,
+            outside=outside,
+            wavelengths=wavelengths,
+            same_on_batch=same_on_batch,
+            p=p,
+            keepdim=keepdim,
+        )
+        nearest, longest = self.bounds("focus")[0], self.bounds("focal_length")[1]
+        if nearest <= longest:
+            raise ValueError(
+                f"focus {nearest:g} m is inside the focal length of {longest:g} m: no real image. Use "
+                f"focus=({2 * longest:g}, ...) or a shorter focal_length."
+            )
+        if isinstance(layers, bool) or not isinstance(layers, int) or layers < 1:
+            raise ValueError(f"layers must be a whole number of 1 or more, got {layers!r}.")
+        self.layers = layers
+        self.flags |= {"layers": layers}
+
+    def widest(self, wavelengths: Tensor) -> float:
+        """The blur of the widest aperture, or the diffraction of the narrowest."""
+        shortest, longest = self.bounds("focal_length")
+        near, far = (1 / bound for bound in self.bounds("focus"))
+        ends = [1 / bound for bound in self.bounds("distance")]
+        most = max(abs(end - focus) for end in ends for focus in (near, far))
+        sensor_distance = 1 / (1 / longest - near)
+        widths = []
+        for number in self.bounds("f_number"):
+            blur = longest / (2 * number) * most * sensor_distance
+            radius = shortest / (2 * number)
+            widths.append(blur + self.tail(radius=radius, sensor_distance=sensor_distance, wavelengths=wavelengths))
+        return max(widths)
+
+    def psfs(self, drawn: dict[str, Tensor], *, wavelengths: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
+        """(B, 1, L, h, w), or (B, Z, L, h, w) for drawn["vergences"] (B, Z)."""
+        focal, focus = drawn["focal_length"].double(), drawn["focus"].double()
+        at = drawn["vergences"] if "vergences" in drawn else 1 / drawn["distance"].double()[:, None]
+        return self.bank(
+            at - 1 / focus[:, None].to(at.device),
+            radii=focal / (2 * drawn["f_number"].double()),
+            sensor_distance=1 / (1 / focal - 1 / focus),
+            wavelengths=wavelengths,
+            shape=shape,
+            like=like,
+        )
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """One depth at once; with a map sample by sample, layer by layer."""
+        if "inverse_depth" not in drawn:
+            return super().simulate(signal, drawn)
+        depth = check_inverse_depth(drawn["inverse_depth"], signal).double()
+        wavelengths = wavelengths_of(signal, self.wavelengths)
+        low, high = depth.amin((1, 2, 3)), depth.amax((1, 2, 3))
+        share = torch.linspace(0, 1, self.layers, dtype=torch.float64, device=depth.device)
+        if self.layers == 1:
+            share = share + 0.5
+        vergences = low[:, None] + (high - low)[:, None] * share
+        shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
+        psfs = self.psfs(drawn | {"vergences": vergences}, wavelengths=wavelengths, shape=shape, like=signal)
+        rows = []
+        for index in range(len(signal)):
+            shares = None
+            if self.layers > 1 and high[index] > low[index]:
+                shares = layer_shares(depth[index : index + 1], vergences[index]).to(signal)
+            layers = Layers(signal[index : index + 1], shares)
+            renderer = Renderer(psfs[index], spectra=None, weights=None, picture=(signal.shape[-2], signal.shape[-1]))
+            layers.add(renderer, first=0)
+            rows.append(layers.light)
+        return torch.cat(rows)
+
+
+def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:
+    """A map of inverse depth as (B,1,H,W) on the device of a signal (B,C,H,W); ValueError for what can be none."""
+    expected = (signal.shape[0], 1, *signal.shape[-2:])
+    depth = depth[:, None] if depth.ndim == 3 else depth
+    if depth.ndim != 4 or depth.shape != expected:
+        raise ValueError(f"inverse_depth has shape {tuple(depth.shape)}, expected {expected}, in 1/m.")
+    low = float(depth.detach().min())
+    if not (low >= 0 and bool(depth.isfinite().all())):
+        raise ValueError(
+            f"inverse_depth has values from {low:g} to {float(depth.max()):g}, expected finite ones >= 0 [1/m]: 1 over "
+            "the distance in metres, 0 at infinity."
+        )
+    return depth.to(signal.device)
+
+
+class FocusedBlur(RandomBlur):
+    """Base of the augmentations by a lens that is in focus, at infinity, on its own wavefront error."""
+
+    def __init__(
+        self,
+        draws: dict[str, Draw],
+        *,
+        f_number: Bounds,
+        focal_length: float,
+        pixel_pitch: float,
+        outside: float,
+        wavelengths: Tensor | list[float] | None,
+        same_on_batch: bool,
+        p: float,
+        keepdim: bool,
+    ) -> None:
+        super().__init__(
+            draws | {"f_number": Uniform(f_number, "log", least=0.5, most=200.0)},
+            pixel_pitch=pixel_pitch,
+            outside=outside,
+            wavelengths=wavelengths,
+            same_on_batch=same_on_batch,
+            p=p,
+            keepdim=keepdim,
+        )
+        self.focal_length = check_length(
+            focal_length, name="focal_length", within=FOCAL_LENGTH_RANGE, example=f"{FOCAL_LENGTH:g}"
+        )
+        self.flags |= {"focal_length": self.focal_length}
+
+    def coefficients(self, drawn: dict[str, Tensor]) -> Tensor | None:
+        """Noll's Zernikes (B, K) [m RMS], or None."""
+        return None
+
+    def vergences(self, drawn: dict[str, Tensor], wavelengths: Tensor) -> Tensor:
+        """Residual vergence (B,) or (B, 1, L) [1/m]."""
+        return torch.zeros_like(drawn["f_number"].double())
+
+    def slope(self, wavelengths: Tensor, *, radius: float) -> float:
+        """Largest slope of the wavefront over the pupil in the ranges: the angle of a ray [rad]."""
+        return 0.0
+
+    def widest(self, wavelengths: Tensor) -> float:
+        """Diffraction and rays, at the ends of the range of f-numbers."""
+        widths = []
+        for number in self.bounds("f_number"):
+            radius = self.focal_length / (2 * number)
+            tail = self.tail(radius=radius, sensor_distance=self.focal_length, wavelengths=wavelengths)
+            widths.append(tail + self.slope(wavelengths, radius=radius) * self.focal_length)
+        return max(widths)
+
+    def psfs(self, drawn: dict[str, Tensor], *, wavelengths: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
+        """(B, 1, L, h, w)."""
+        return self.bank(
+            self.vergences(drawn, wavelengths),
+            radii=self.focal_length / (2 * drawn["f_number"].double()),
+            coefficients=self.coefficients(drawn),
+            sensor_distance=self.focal_length,
+            wavelengths=wavelengths,
+            shape=shape,
+            like=like,
+        )
+
+
+class RandomDiffraction(FocusedBlur):
+    """A lens in focus and stopped down: Airy discs, larger in red than in blue.
+
+    Args:      f_number: N, drawn uniformly in its logarithm. focal_length, pixel_pitch: [m]. Others: as `RandomBlur`.
+    """
+
+    def __init__(
+        self,
+        f_number: Bounds = (8.0, 32.0),
+        *,
+        focal_length: float = FOCAL_LENGTH,
+        pixel_pitch: float = PIXEL_PITCH,
+        outside: float = 0.01,
+        wavelengths: Tensor | list[float] | None = None,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        super().__init__(
+            {},
+            f_number=f_number,
+            focal_length=focal_length,
+            pixel_pitch=pixel_pitch,
+            outside=outside,
+            wavelengths=wavelengths,
+            same_on_batch=same_on_batch,
+            p=p,
+            keepdim=keepdim,
+        )
+
+
+class RandomAberration(FocusedBlur):
+    """Random aberrations of a lens in focus: Zernike polynomials Z4 to Z15, of a drawn RMS in all.
+
+    W = sum_j c_j Z_j,   sum_j c_j^2 = (rms 550 nm)^2,   in a direction that is uniform on the sphere
+
+    Args:      rms: of the wavefront [waves at 550 nm]; 0.07 is the limit of what counts as diffraction limited.
+               f_number, focal_length, pixel_pitch: of the lens. Others: as for `RandomBlur`.
+    Source:    Noll, J. Opt. Soc. Am. 66, 207 (1976).
+    """
+
+    TERMS = 12  # Z4 .. Z15: all but piston and tilts, up to the fourth order
+
+    def __init__(
+        self,
+        rms: Bounds = (0.0, 0.5),
+        f_number: Bounds = (1.8, 8.0),
+        *,
+        focal_length: float = FOCAL_LENGTH,
+        pixel_pitch: float = PIXEL_PITCH,
+        outside: float = 0.01,
+        wavelengths: Tensor | list[float] | None = None,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        super().__init__(
+            {"rms": Uniform(rms, least=0.0, most=50.0, unit="[waves]"), "direction": Normal(self.TERMS)},
+            f_number=f_number,
+            focal_length=focal_length,
+            pixel_pitch=pixel_pitch,
+            outside=outside,
+            wavelengths=wavelengths,
+            same_on_batch=same_on_batch,
+            p=p,
+            keepdim=keepdim,
+        )
+
+    def coefficients(self, drawn: dict[str, Tensor]) -> Tensor:
+        """(B, 15) [m RMS]; the first three are 0."""
+        direction = F.normalize(drawn["direction"].double(), dim=1)
+        return F.pad(direction * drawn["rms"].double()[:, None].to(direction) * DESIGN, (3, 0))
+
+    def slope(self, wavelengths: Tensor, *, radius: float) -> float:
+        """A Zernike of order n rises by up to n sqrt(2 n + 2) times its RMS at the rim; here n is at most 4."""
+        return self.bounds("rms")[1] * DESIGN * 4 * math.sqrt(10) / radius
+
+
+class RandomChromaticAberration(FocusedBlur):
+    """Colour fringes of a lens whose glass disperses, as far as its designer left them.
+
+    axial:   the lens is in focus at 550 nm; elsewhere its power is off by  axial (n(lambda) - n_0) / (n_0 - 1) / f
+    lateral: the picture at lambda is (1 + lateral (n(lambda) - n_0) / (n_F - n_C)) times as large; n_F - n_C between
+             486.1 and 656.3 nm
+
+    Masks, boxes and keypoints stay: green does not move. Beyond the border the picture is reflected.
+
+    Args:      axial: share of a simple lens's focal shift that is left; 1 is a singlet. lateral: difference of
+                   magnification between F and C light, signed. f_number, focal_length, pixel_pitch: of the lens.
+               glass: a name in `optics.GLASSES`. Others: as for `RandomBlur`.
+    """
+
+    def __init__(
+        self,
+        axial: Bounds = (0.0, 0.3),
+        lateral: Bounds = (-4e-3, 4e-3),
+        f_number: Bounds = (1.8, 8.0),
+        *,
+        focal_length: float = FOCAL_LENGTH,
+        pixel_pitch: float = PIXEL_PITCH,
+        glass: str = "N-BK7",
+        outside: float = 0.01,
+        wavelengths: Tensor | list[float] | None = None,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        draws: dict[str, Draw] = {
+            "axial": Uniform(axial, least=-10.0, most=10.0),
+            "lateral": Uniform(lateral, least=-0.2, most=0.2),
+        }
+        super().__init__(
+            draws,
+            f_number=f_number,
+            focal_length=focal_length,
+            pixel_pitch=pixel_pitch,
+            outside=outside,
+            wavelengths=wavelengths,
+            same_on_batch=same_on_batch,
+            p=p,
+            keepdim=keepdim,
+        )
+        self.glass = glass
+        self.flags |= {"glass": glass}
+        self.dispersion(wavelength_grid([DESIGN]))  # refuses an unknown glass
+
+    def dispersion(self, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+        """(n - n_0) / (n_0 - 1) and (n - n_0) / (n_F - n_C), (L,) each."""
+        lines = torch.tensor([DESIGN, 486.1 * nm, 656.3 * nm], dtype=torch.float64)
+        own = refractive_index(self.glass, wavelengths=wavelengths.double())
+        centre, f_line, c_line = refractive_index(self.glass, wavelengths=lines)
+        return (own - centre) / (centre - 1), (own - centre) / (f_line - c_line)
+
+    def vergences(self, drawn: dict[str, Tensor], wavelengths: Tensor) -> Tensor:
+        """More power focuses nearer: what is left is a vergence of the other sign."""
+        power, _ = self.dispersion(wavelengths)
+        axial = drawn["axial"].double()
+        return -axial[:, None, None] * power.to(axial.device) / self.focal_length
+
+    def slope(self, wavelengths: Tensor, *, radius: float) -> float:
+        """Of the focal shift at the ends of the spectrum."""
+        power, _ = self.dispersion(wavelengths)
+        most = max(abs(bound) for bound in self.bounds("axial")) * float(power.abs().max())
+        return radius * most / self.focal_length
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Each channel at its size, then blurred."""
+        _, relative = self.dispersion(wavelengths_of(signal, self.wavelengths))
+        lateral = drawn["lateral"].double()
+        scale = 1 + lateral[:, None] * relative.to(lateral.device)
+        return super().simulate(magnify(signal, scale), drawn)
+
+
+def magnify(signal: Tensor, scale: Tensor) -> Tensor:
+    """Each channel (B,C,H,W) `scale` (B,C) times as large about the picture's centre; bilinear, reflected outside."""
+    batch, channels, height, width = signal.shape
+    side = [torch.arange(n, dtype=torch.float64, device=signal.device) * 2 + 1 for n in (height, width)]
+    y, x = (position / n - 1 for position, n in zip(side, (height, width), strict=True))
+    grid = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+    grid = (grid / scale.to(signal.device).flatten()[:, None, None, None]).to(signal)
+    planes = signal.reshape(batch * channels, 1, height, width)
+    moved = F.grid_sample(planes, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
+    return moved.view(signal.shape)
+
+
+class RandomVignetting(CameraAugmentation):
+    """Light falls off towards the corners: cos^4 of the field angle, and less of the pupil is seen from the side.
+
+    E / E_0 = cos^4(theta) (1 - shade u^2),   tan(theta) = u tan(field / 2),   u the distance from the centre, 1 at the
+    corners
+
+    Args:      field: full angle between opposite corners [degrees]; 47 is a 50 mm lens on full frame, 75 a phone.
+               shade: share of the pupil that the corner does not see.
+    Source:    the cos^4 law: Born and Wolf, Principles of Optics, section 4.8.
+    """
+
+    def __init__(
+        self,
+        field: Bounds = (20.0, 80.0),
+        shade: Bounds = (0.0, 0.4),
+        *,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        draws: dict[str, Draw] = {
+            "field": Uniform(field, least=0.0, most=160.0, unit="[degrees]"),
+            "shade": Uniform(shade, least=0.0, most=1.0),
+        }
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+
+    @staticmethod
+    def falloff(shape: tuple[int, int], *, drawn: dict[str, Tensor], like: Tensor) -> Tensor:
+        """(B,1,H,W), 1 at the centre."""
+        height, width = shape
+        y, x = (torch.arange(n, dtype=like.dtype, device=like.device) - (n - 1) / 2 for n in shape)
+        corner = max(((height - 1) ** 2 + (width - 1) ** 2) / 4, 1e-12)
+        u2 = (x[None, :] ** 2 + y[:, None] ** 2) / corner
+        tangent = torch.tan(torch.deg2rad(per_sample(drawn["field"], like)) / 2)
+        return (1 - per_sample(drawn["shade"], like) * u2) / (1 + tangent**2 * u2) ** 2
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """All channels alike."""
+        return signal * self.falloff((signal.shape[-2], signal.shape[-1]), drawn=drawn, like=signal)

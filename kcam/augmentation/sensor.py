@@ -1,0 +1,223 @@
+"""The sensor: its mosaic, its noise, its pattern, its well and its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, per_sample
+from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
+from kcam.camera import Camera
+from kcam.context import Context
+from kcam.isp import ColourMatrix, Demosaic, ToneCurve, WhiteBalance, demosaic
+from kcam.sensor import ColourFilter, Exposure, Mosaic, mosaic, quantise, read_noise, shot_noise
+from kcam.sensor.noise import fixed_pattern
+from kcam.ste import clip_ste
+from kcam.units import check_positive, wavelength_grid
+
+BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
+
+
+class RandomBayer(CameraAugmentation):
+    """Mosaic and demosaic: what a sensor of one colour per pixel loses.
+
+    A picture is mosaiced in linear light and filled in again. A cube of bands becomes a picture: through the colour
+    filter, the mosaic and the demosaic, white balance, colour matrix and tone curve of a noiseless camera.
+
+    Args:      pattern: "random" for one of the four phases of the Bayer pattern, a name in `sensor.PATTERNS` (of three
+                   channels on pictures), or several names.
+               method: a name in `isp.DEMOSAICS`; None for the default of the pattern.
+               colour_filter: for cubes; None for `ColourFilter.kodak()`, or `rgbw()` for the pattern of that name.
+               wavelengths: of a cube's bands [m].
+    Raises:    ValueError for an unknown pattern or method; at the call, for a cube with p < 1.
+    """
+
+    def __init__(
+        self,
+        pattern: str | Sequence[str] = "random",
+        *,
+        method: str | None = None,
+        colour_filter: ColourFilter | None = None,
+        wavelengths: Tensor | None = None,
+        same_on_batch: bool = False,
+        p: float = 1.0,
+        keepdim: bool = False,
+    ) -> None:
+        names = BAYER if pattern == "random" else (pattern,) if isinstance(pattern, str) else tuple(pattern)
+        for name in names:
+            Demosaic(method, pattern=name)  # refuses what does not exist
+        super().__init__({"pattern": Choice(len(names))}, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        self.patterns, self.method = names, method
+        self.flags = {"patterns": "/".join(names), "method": method}
+        self.colour_filter = colour_filter
+        self.wavelengths = None if wavelengths is None else wavelength_grid(wavelengths)
+
+    def output_channels(self, channels: int) -> int:
+        """A picture stays one; a cube becomes one of three channels."""
+        return channels if channels == 1 else 3
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """The pattern, and for Kornia's containers the shape after a cube has become a picture."""
+        return super().generate_parameters(batch_shape) | announced(self, batch_shape)
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Each pattern's rows at once."""
+        result = signal.new_zeros(len(signal), self.output_channels(signal.shape[1]), *signal.shape[2:])
+        for index in drawn["pattern"].unique().tolist():
+            rows = (drawn["pattern"] == index).nonzero().flatten().to(signal.device)
+            result = result.index_copy(0, rows, self._one(signal[rows], self.patterns[index]))
+        return result
+
+    def _one(self, signal: Tensor, pattern: str) -> Tensor:
+        if is_picture(signal):
+            recorded = mosaic(signal.expand(-1, 3, -1, -1), pattern=pattern)
+            return demosaic(recorded, pattern=pattern, method=self.method)[:, : signal.shape[1]]
+        own = self.colour_filter
+        if own is None:
+            own = ColourFilter.rgbw() if pattern == "rgbw" else ColourFilter.kodak()
+        wavelengths = wavelength_grid(count=signal.shape[1]) if self.wavelengths is None else self.wavelengths
+        stages = (own, Mosaic(pattern), Exposure(), Demosaic(self.method), WhiteBalance(), ColourMatrix(), ToneCurve())
+        return Camera(*stages, context=Context(wavelengths=wavelengths))(signal)
+
+
+def announced(stage: CameraAugmentation, batch_shape: Sequence[int]) -> dict[str, Tensor]:
+    """For Kornia's containers, which draw for later stages beforehand: the shape after this one, where it changes."""
+    batch, channels = batch_shape[0], batch_shape[-3]
+    after = stage.output_channels(channels)
+    if after == channels:
+        return {}
+    if stage.p < 1:
+        raise ValueError(
+            f"{type(stage).__name__} turns {channels} channels into {after}, which only some rows of a batch cannot "
+            f"have. Use p=1.0, not p={stage.p:g}."
+        )
+    return {"output_size": torch.tensor([[after, *batch_shape[-2:]]]).expand(batch, 3)}
+
+
+class RandomShotReadNoise(CameraAugmentation):
+    """Photon noise and read-out noise at a random ISO, in EMVA 1288 terms, in linear light.
+
+    y = min(g (N / w + (sigma_d / w) e), 1),   N ~ Poisson(x w / g),   e ~ N(0, 1),   g = iso / 100
+
+    with w the full well [electrons] and x = 1 the white that fills the range: its variance against its mean is the
+    photon transfer line  var = (g / w) x + (g sigma_d / w)^2.
+
+    Args:      iso: 100 is base, drawn uniformly in its logarithm. full_well: [electrons] at base ISO.
+               read_noise: sigma_d [electrons].
+    Raises:    ValueError for bounds that are not positive.
+    """
+
+    def __init__(
+        self,
+        iso: Bounds = (100.0, 3200.0),
+        *,
+        full_well: Bounds = 10_000.0,
+        read_noise: Bounds = 3.0,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        draws: dict[str, Draw] = {
+            "iso": Uniform(iso, "log", least=1e-3, unit="(100 is base)"),
+            "full_well": Uniform(full_well, "log", least=1.0, unit="[electrons]"),
+            "read_noise": Uniform(read_noise, least=0.0, unit="[electrons]"),
+            "noise_seed": Seed(),
+        }
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Row by row, each from its own seed."""
+        gain, well, sigma = (per_sample(drawn[name], signal) for name in ("iso", "full_well", "read_noise"))
+        gain = gain / 100
+        generators = each_generator(drawn["noise_seed"], signal.device)
+        rows = []
+        for index, generator in enumerate(generators):
+            row = slice(index, index + 1)
+            exposed = shot_noise(signal[row] / gain[row], full_well=well[row], generator=generator)
+            read = read_noise(exposed, sigma_electrons=sigma[row], full_well=well[row], generator=generator)
+            rows.append(clip_ste(read * gain[row], None, 1.0))
+        return torch.cat(rows)
+
+
+class RandomFixedPattern(CameraAugmentation):
+    """The uneven pixels of one sensor, PRNU and DSNU: `sensor.fixed_pattern`, a new sensor for each sample.
+
+    In `K.VideoSequential` the frames of a clip share their sensor.
+
+    Args:      prnu: relative spread of the gain. dsnu: spread of the offset [electrons]. full_well: [electrons].
+    """
+
+    def __init__(
+        self,
+        prnu: Bounds = (0.0, 0.02),
+        dsnu: Bounds = (0.0, 10.0),
+        *,
+        full_well: float = 10_000.0,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        check_positive(full_well, name="full_well", unit="electrons")
+        draws: dict[str, Draw] = {
+            "prnu": Uniform(prnu, least=0.0),
+            "dsnu": Uniform(dsnu, least=0.0, unit="[electrons]"),
+            "sensor_seed": Seed(),
+        }
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        self.flags = {"full_well": full_well}
+        self.full_well = full_well
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Row by row, each from its own seed."""
+        prnu, dsnu = (per_sample(drawn[name], signal) for name in ("prnu", "dsnu"))
+        rows = []
+        for index, seed in enumerate(drawn["sensor_seed"].tolist()):
+            row = slice(index, index + 1)
+            rows.append(fixed_pattern(signal[row], prnu=prnu[row], dsnu=dsnu[row], full_well=self.full_well, seed=seed))
+        return torch.cat(rows)
+
+
+class RandomExposure(CameraAugmentation):
+    """Over- and underexposure: linear light times 2^stops, cut off at the full well, 1.0.
+
+    Args:      stops: of exposure; above 0 the highlights saturate.
+    """
+
+    def __init__(
+        self, stops: Bounds = (-1.0, 1.5), *, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False
+    ) -> None:
+        super().__init__({"stops": Uniform(stops, unit="[stops]")}, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """The gradient beyond the well is that of `clip_ste`."""
+        return clip_ste(signal * per_sample(2 ** drawn["stops"], signal), 0.0, 1.0)
+
+
+class RandomQuantisation(CameraAugmentation):
+    """The steps of an ADC in linear light, `sensor.quantise`, with its straight-through gradient.
+
+    Args:      bits: (fewest, most), whole numbers 1 to 24; each number of bits is as likely.
+    Raises:    ValueError for other numbers.
+    """
+
+    def __init__(
+        self,
+        bits: tuple[int, int] | int = (6, 10),
+        *,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        low, high = (bits, bits) if isinstance(bits, int) else bits
+        if not (isinstance(low, int) and isinstance(high, int) and 1 <= low <= high <= 24):
+            raise ValueError(f"bits must be whole numbers (fewest, most) within 1..24, got {bits!r}.")
+        super().__init__({"bits": Choice(high - low + 1)}, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        self.flags = {"range": (low, high)}
+        self.fewest = low
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Each row with its own steps."""
+        bits = (self.fewest + drawn["bits"]).tolist()
+        return torch.cat([quantise(signal[i : i + 1], bits=count) for i, count in enumerate(bits)])

@@ -1,0 +1,230 @@
+"""`CameraSequential`: Kornia's container for pipelines in which channels change and depth counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import kornia.augmentation as K
+import torch
+from kornia.augmentation.base import _AugmentationBase
+from kornia.augmentation.container.base import ImageSequentialBase
+from kornia.augmentation.container.image import _get_new_batch_shape
+from kornia.augmentation.container.ops import AugmentationSequentialOps, InputSequentialOps
+from kornia.augmentation.container.params import ParamItem
+from kornia.constants import DataKey
+from torch import Tensor, nn
+
+from kcam.augmentation.optics import check_inverse_depth
+from kcam.camera import DEMOSAICING, Camera
+from kcam.context import Context, Stage
+from kcam.optics import Imaging
+from kcam.scene import Scene
+from kcam.sensor import ColourFilter, Mosaic
+
+_LEAST_VERGENCE = 1e-9  # 1/m
+
+
+class CameraSequential(K.AugmentationSequential):
+    """`K.AugmentationSequential` in which camera stages may stand, channels may change, and stages see depth.
+
+    - Plain kcam stages (`optics.Imaging`, `sensor.Mosaic`, ...) are told of each other as in a `Camera`: a Demosaic
+      knows the pattern of the Mosaic before it, and a contradiction is an error when the container is built.
+    - Every augmentation draws for the channels that really reach it (Kornia's containers draw for those of the input).
+      A module of one's own says what it gives by a method ``output_channels(channels)``.
+    - The first mask is a map of inverse depth [1/m], 0 at infinity, which `RandomDefocus`, `RandomCamera` and `Imaging`
+      see as it is when they are reached: flipped and cropped with the picture. Inside another container there are no
+      masks to see, so a nested one takes its own distances.
+
+    Args:      depth: False where the first mask is no depth.
+               depth_key: which mask it is instead: its place in data_keys, or its name in a dict call ("mask_depth").
+               Others: as for `K.AugmentationSequential`.
+    Raises:    ValueError for stages that contradict each other or stand in an impossible order, geometry between a
+        mosaic and its demosaic, random_apply with stages; at the call for a depth_key that is no mask, or a module that
+        changes its channels without saying so.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        data_keys: Sequence[str] | Sequence[int] | Sequence[DataKey] | None = (DataKey.INPUT,),
+        depth: bool = True,
+        depth_key: int | str | None = None,
+        same_on_batch: bool | None = None,
+        keepdim: bool | None = None,
+        random_apply: int | bool | tuple[int, int] = False,
+        random_apply_weights: Sequence[float] | Tensor | None = None,
+        extra_args: dict[DataKey, dict[str, Any]] | None = None,
+    ) -> None:
+        super().__init__(
+            *args,
+            data_keys=data_keys,
+            same_on_batch=same_on_batch,
+            keepdim=keepdim,
+            random_apply=random_apply,
+            random_apply_weights=random_apply_weights,
+            extra_args=extra_args,
+        )
+        self.depth, self.depth_key = depth, depth_key
+        self.transform_op: _Ops = _Ops(self.data_keys, self)
+        if random_apply and self._stages():
+            raise ValueError("random_apply would shuffle camera stages, which light passes in order. Leave it out.")
+        self.context()
+        _check_geometry(_flat(self.children()))
+
+    def _stages(self) -> list[nn.Module]:
+        return [module for module in _flat(self.children()) if isinstance(module, Stage)]
+
+    def context(self) -> Context:
+        """What the stages tell each other."""
+        return Camera(*self._stages()).resolve()
+
+    def output_channels(self, channels: int) -> int:
+        """Channels of the result for so many of the input."""
+        for module in self.children():
+            channels = self._after(module, channels)
+        return channels
+
+    def _after(self, module: nn.Module, channels: int) -> int:
+        if isinstance(module, Stage):
+            return module.output_channels(channels, self.context())
+        known: Any = getattr(module, "output_channels", None)
+        return known(channels) if callable(known) else channels
+
+    def forward_parameters(self, batch_shape: torch.Size) -> list[ParamItem]:
+        """Kornia's, for the shape that really reaches each module."""
+        params = []
+        module: Any
+        for name, module in self.get_forward_sequence():
+            draws = isinstance(module, (_AugmentationBase, K.MixAugmentationBaseV2, ImageSequentialBase))
+            param = ParamItem(name, module.forward_parameters(batch_shape) if draws else None)
+            after = list(_get_new_batch_shape(param, batch_shape, module))
+            after[-3] = self._after(module, batch_shape[-3])
+            batch_shape = torch.Size(after)
+            params.append(param)
+        return params
+
+    def transform_inputs(
+        self, input: Tensor, params: list[ParamItem], extra_args: dict[str, Any] | None = None
+    ) -> Tensor:
+        """What another container calls: pictures alone."""
+        self.clear_state()
+        for param in params:
+            module = self.get_submodule(param.name)
+            if self.runs(module):
+                input = self.run(module, input, depth=None)
+            else:
+                input = InputSequentialOps.transform(input, module=module, param=param, extra_args=extra_args)
+            self._update_transform_matrix_by_module(module)
+        self._params = params
+        return input
+
+    @staticmethod
+    def runs(module: nn.Module) -> bool:
+        """Whether it is a plain module, which Kornia would call without context and without looking at its result."""
+        return not isinstance(module, (_AugmentationBase, K.MixAugmentationBaseV2, ImageSequentialBase))
+
+    def run(self, module: nn.Module, input: Tensor, *, depth: Tensor | None) -> Tensor:
+        """A plain module; a stage is told of its neighbours, and an Imaging of the depth."""
+        channels = input.shape[1]
+        if isinstance(module, Stage):
+            context = self.context()
+            if isinstance(module, Imaging) and depth is not None:
+                return module(_scene(input, depth, context), context)
+            return module(input, context)
+        result = module(input)
+        after = result.shape[1] if isinstance(result, Tensor) and result.ndim == 4 else channels
+        if after != self._after(module, channels):
+            raise ValueError(
+                f"{type(module).__name__} gave {after} channels for {channels}, and what follows was drawn for "
+                f"{self._after(module, channels)}. Give it a method output_channels(channels) that returns {after}."
+            )
+        return result
+
+    def forward(self, *args: Any, params: list[ParamItem] | None = None, data_keys: Any = None) -> Any:
+        """As `K.AugmentationSequential`."""
+        names = list(args[0]) if len(args) == 1 and isinstance(args[0], dict) else None
+        self.transform_op.names = names
+        try:
+            return super().forward(*args, params=params, data_keys=data_keys)
+        finally:
+            self.transform_op.names = None
+
+
+class _Ops(AugmentationSequentialOps):
+    """Hands the depth and the context to the modules that want them."""
+
+    def __init__(self, data_keys: list[DataKey] | None, owner: CameraSequential) -> None:
+        super().__init__(data_keys)
+        self.owner = [owner]  # in a list: a module in an attribute would be its child
+        self.names: list[str] | None = None
+
+    def transform(self, *arg: Any, module: nn.Module, param: ParamItem, extra_args: Any, data_keys: Any = None) -> Any:
+        owner = self.owner[0]
+        keys = self.preproc_datakeys(data_keys)
+        if owner.runs(module):
+            depth = self._depth(arg, keys) if isinstance(module, Imaging) else None
+            outputs = [
+                owner.run(module, value, depth=depth) if key == DataKey.INPUT else value
+                for value, key in zip(arg, keys, strict=True)
+            ]
+            return outputs[0] if len(outputs) == 1 else outputs
+        if getattr(module, "takes_depth", False):
+            depth = self._depth(arg, keys)
+            if depth is not None:
+                own = {**extra_args.get(DataKey.INPUT, {}), "inverse_depth": depth}
+                extra_args = {**extra_args, DataKey.INPUT: own}
+        return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
+
+    def _depth(self, arg: Sequence[Any], keys: list[DataKey]) -> Tensor | None:
+        """The mask that is a depth, as it is now."""
+        owner = self.owner[0]
+        masks = [index for index, key in enumerate(keys) if key == DataKey.MASK]
+        if not owner.depth:
+            return None
+        wanted = owner.depth_key
+        if wanted is None:
+            if not masks:
+                return None
+            index = masks[0]
+        else:
+            if isinstance(wanted, str):
+                index = (self.names or []).index(wanted) if wanted in (self.names or []) else -1
+            else:
+                index = wanted
+            if index not in masks:
+                raise ValueError(
+                    f"depth_key={wanted!r} is none of the masks of this call, which are at {masks} of "
+                    f"{[key.name for key in keys]}. Give its place in data_keys, or its name in the dict."
+                )
+        if not isinstance(arg[index], Tensor):
+            raise TypeError("the depth is a list of masks of different sizes; expected one tensor (B,1,H,W).")
+        return arg[index]
+
+
+def _scene(bands: Tensor, depth: Tensor, context: Context) -> Scene:
+    vergence = check_inverse_depth(depth, bands).double().clamp(min=_LEAST_VERGENCE)
+    light = "D65" if context.illuminant is None else context.illuminant
+    return Scene.from_bands(bands, wavelengths=context.wavelengths, depth=1 / vergence, illuminant=light)
+
+
+def _flat(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
+    for module in modules:
+        if isinstance(module, ImageSequentialBase):
+            yield from _flat(module.children())
+        else:
+            yield module
+
+
+def _check_geometry(modules: Iterable[nn.Module]) -> None:
+    mosaic = None
+    for module in modules:
+        if isinstance(module, Mosaic) or (isinstance(module, ColourFilter) and module.is_tile):
+            mosaic = type(module).__name__
+        elif isinstance(module, DEMOSAICING):
+            mosaic = None
+        elif mosaic and isinstance(module, K.GeometricAugmentationBase2D):
+            raise ValueError(
+                f"{type(module).__name__} stands between {mosaic} and the demosaic: moved pixels would get the colour "
+                f"of others. Put it before {mosaic} or after the Demosaic."
+            )
