@@ -8,6 +8,7 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from kcam.optics import sampling
 from kcam.optics.elements import zernike_sum
@@ -18,7 +19,7 @@ from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 
 _STEP = math.pi / 24  # of t in the table of J0: |U|^2 by cubic interpolation is then good to 1e-4 of its fringes
 _PROFILE_STEPS = 16  # of the profile for each of its fringes; cubic between them
-_LARGEST_TABLE = 2**26  # entries, 512 MB
+_KEPT_TABLE, _LARGEST_TABLE = 2**22, 2**31  # entries: 34 MB; a minute
 
 
 def batch_psf(
@@ -165,15 +166,21 @@ def _radial_bank(
         defocus = float((residual.abs().amax((1, 2)) * d * a * wavenumbers.max() * a / d).max())  # of the rim ray, in t
         per_pixel = 2 ** max(3, math.ceil(math.log2(_PROFILE_STEPS * fastest / math.pi)))
         corner = math.sqrt(2) * (half + 0.5)
-        table = _hankel_table(_rounded((fastest * corner + defocus) / 2 + 32), _rounded(fastest * corner / _STEP + 8))
-    rho, weights, bessel = (value.to(residual.device) for value in table)
+        nodes, arguments = _rounded((fastest * corner + defocus) / 2 + 32), _rounded(fastest * corner / _STEP + 8)
+    if nodes * arguments > _LARGEST_TABLE:
+        raise ValueError(
+            f"this batch needs a Hankel table of {nodes} x {arguments}, more than {_LARGEST_TABLE} numbers: the PSF is "
+            "thousands of fringes wide. Use a smaller shape, larger f-numbers or distances nearer to the focus."
+        )
+    rho, weights = (torch.as_tensor(value, device=residual.device) for value in legendre(nodes))
+    rho, weights = (rho + 1) / 2, weights / 2
     phase = (wavenumbers[:, None] * residual.transpose(1, 2) * (a[:, None, None] ** 2 / 2))[..., None] * rho**2
     amplitude = 2 * rho * weights  # (B, L, Z, n) below
-    re, im = ((wave * amplitude) @ bessel for wave in (phase.cos(), phase.sin()))
-    intensity = re.square() + im.square()  # (B, L, Z, T)
+    field = torch.stack([phase.cos(), phase.sin()]) * amplitude
+    intensity = _hankel(field, rho, arguments).square().sum(0)  # (B, L, Z, T)
     steps = torch.arange(math.ceil(corner * per_pixel) + 3, dtype=torch.float64, device=residual.device)
     position = scales[..., None] * (steps * (pixel_pitch / per_pixel / _STEP))  # (B, L, R)
-    low = torch.clamp(position.detach().floor().long(), max=bessel.shape[1] - 3)
+    low = torch.clamp(position.detach().floor().long(), max=arguments - 3)
     offset = position - low
     profile = torch.zeros(())
     for tap, weight in zip((-1, 0, 1, 2), _cubic(offset), strict=True):
@@ -194,18 +201,26 @@ def _rounded(count: float) -> int:
     return int(step * math.ceil(count / step))
 
 
+def _hankel(field: Tensor, rho: Tensor, arguments: int) -> Tensor:
+    """SUM field J0(t rho) at t = 0, _STEP, ...: (..., n) -> (..., T). Small tables are kept, large ones made in parts."""
+    nodes = len(rho)
+    if nodes * arguments <= _KEPT_TABLE:
+        return field @ _bessel_table(nodes, arguments, field.device)
+
+    def part(field: Tensor, first: int, last: int) -> Tensor:
+        t = torch.arange(first, last, dtype=torch.float64, device=field.device) * _STEP
+        return field @ torch.special.bessel_j0(rho[:, None] * t)
+
+    step = max(1, _KEPT_TABLE // nodes)
+    ends = [(first, min(first + step, arguments)) for first in range(0, arguments, step)]
+    return torch.cat([checkpoint(part, field, *end, use_reentrant=False) for end in ends], dim=-1)
+
+
 @functools.lru_cache(maxsize=12)
-def _hankel_table(nodes: int, arguments: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Gauss-Legendre rho and weights (n,) on 0..1, and J0(t rho) (n, T) at t = 0, _STEP, ..."""
-    if nodes * arguments > _LARGEST_TABLE:
-        raise ValueError(
-            f"this batch needs a Hankel table of {nodes} x {arguments}, more than {_LARGEST_TABLE} numbers: the PSF is "
-            "thousands of fringes wide. Use a smaller shape, larger f-numbers or distances nearer to the focus."
-        )
-    points, weights = (torch.as_tensor(value) for value in legendre(nodes))
-    rho = (points + 1) / 2
-    t = torch.arange(arguments, dtype=torch.float64) * _STEP
-    return rho, weights / 2, torch.special.bessel_j0(rho[:, None] * t)
+def _bessel_table(nodes: int, arguments: int, device: torch.device) -> Tensor:
+    """J0(t rho), (n, T)."""
+    rho = torch.as_tensor(legendre(nodes)[0], device=device) / 2 + 0.5
+    return torch.special.bessel_j0(rho[:, None] * torch.arange(arguments, dtype=torch.float64, device=device) * _STEP)
 
 
 def _cubic(offset):
