@@ -202,7 +202,7 @@ def _rounded(count: float) -> int:
 
 
 def _hankel(field: Tensor, rho: Tensor, arguments: int) -> Tensor:
-    """SUM field J0(t rho) at t = 0, _STEP, ...: (..., n) -> (..., T). Small tables are kept, large ones made in parts."""
+    """SUM field J0(t rho) at t = 0, _STEP, ...: (..., n) to (..., T). Small tables are kept, others made in parts."""
     nodes = len(rho)
     if nodes * arguments <= _KEPT_TABLE:
         return field @ _bessel_table(nodes, arguments, field.device)
