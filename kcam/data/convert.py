@@ -1,0 +1,127 @@
+"""Convert many scenes into cube files: one failing scene does not stop the others."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kcam.data.cube import SUFFIX, CubeError, write_source
+from kcam.data.readers import Options, open_source, resampled, scene_name, scenes_in
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """How scenes are converted.
+
+    format: a name in `readers.FORMATS`, or None where the files say. options: see `readers.Options`.
+    bands: target wavelengths [m], or None for the source's own. method, edge: see `bands.resampling`.
+    depths: a folder of depth maps [m] for photographs, <scene>.npy (H,W).
+    """
+
+    format: str | None = None
+    options: Options = field(default_factory=Options)
+    bands: np.ndarray | None = None
+    method: str = "pchip"
+    edge: str = "error"
+    depths: Path | None = None
+
+
+@dataclass
+class Report:
+    """What came of each scene: facts of those that were written, reasons of those that failed."""
+
+    written: dict[str, dict[str, Any]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+def convert(
+    inputs: Sequence[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    how: Conversion | None = None,
+    *,
+    workers: int = 1,
+    advance: Callable[[str, int], None] | None = None,
+) -> Report:
+    """Convert files, scene folders, or folders of scenes into ``out/<scene>.tif``.
+
+    An old cube of the same name is replaced when the new one is whole. Of two inputs of one name the first is taken.
+
+    Args:      advance: told of each scene that is done, and how many there are.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    how = how or Conversion()
+    report = Report()
+    jobs: dict[str, Path] = {}
+    for given in inputs:
+        try:
+            for path in scenes_in(Path(given)):
+                name = scene_name(path)
+                if name in jobs:
+                    report.failed[str(path)] = f"another input is called {name} too: {jobs[name]}."
+                else:
+                    jobs[name] = path
+        except OSError as error:
+            report.failed[str(given)] = str(error)
+    for path, facts in _run(list(jobs.values()), out, how, workers):
+        if isinstance(facts, str):
+            report.failed[str(path)] = facts
+        else:
+            report.written[str(path)] = facts
+        if advance:
+            advance(path.name, len(jobs))
+    return report
+
+
+def _run(
+    paths: Sequence[Path], out: Path, how: Conversion, workers: int
+) -> Iterator[tuple[Path, dict[str, Any] | str]]:
+    if workers <= 1 or len(paths) <= 1:
+        for path in paths:
+            yield path, convert_one(path, out, how)
+        return
+    with ProcessPoolExecutor(min(workers, len(paths)), mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(convert_one, path, out, how): path for path in paths}
+        for future in as_completed(running):
+            yield running[future], future.result()
+
+
+def convert_one(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
+    """One scene: its facts, or why it failed."""
+    name = scene_name(path)
+    try:
+        options = replace(how.options, bands=how.bands)
+        if how.depths is not None:
+            options = replace(options, depth=_depth(how.depths / f"{name}.npy"))
+        source = open_source(path, format=how.format, options=options)
+        if how.bands is not None:
+            source = resampled(source, how.bands, method=how.method, edge=how.edge)
+        return write_source(out / f"{name}{SUFFIX}", replace(source, name=name))
+    except (CubeError, ImportError, FileNotFoundError) as error:
+        return str(error)
+    except OSError as error:
+        return f"{type(error).__name__}: {error.strerror or error}"
+    except MemoryError:
+        return "it does not fit into memory."
+    except Exception as error:
+        return f"it cannot be read: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
+
+
+def _depth(path: Path) -> np.ndarray:
+    """A depth map [m]: (H,W), all above 0, inf allowed."""
+    if not path.is_file():
+        raise CubeError(f"there is no depth map {path.name} in {path.parent}.")
+    try:
+        depth = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise CubeError(f"the depth map {path.name} cannot be read: {error}.") from error
+    if depth.ndim != 2 or depth.dtype.kind not in "fui" or not (depth > 0).all():
+        raise CubeError(f"the depth map {path.name} must be (H,W), all above 0 m, got {depth.shape} of {depth.dtype}.")
+    return depth.astype(np.float32)

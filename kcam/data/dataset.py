@@ -1,0 +1,83 @@
+"""Patches for training: a torch Dataset over a patch store."""
+
+from __future__ import annotations
+
+import bisect
+import os
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from kcam.data.patches import read_manifest, scene_array
+from kcam.units import nm
+
+
+class Patch(NamedTuple):
+    """values: (L,H,W) float32. wavelengths: (L,) float64 [m]. scene: its name."""
+
+    values: Tensor
+    wavelengths: Tensor
+    scene: str
+
+
+class PatchDataset(Dataset[Patch]):
+    """The patches of one split of a store, in the order of scenes and positions.
+
+    Files are mapped into memory when they are first needed, in each worker of a DataLoader on its own; reading a patch
+    touches nothing but its bytes.
+
+    Args:      folder: a split, such as "patches/train".
+    Raises:    FileNotFoundError; StoreError for a damaged manifest, and at access for a file that is cut off.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self.manifest = read_manifest(self.folder)
+        self.scenes: list[dict[str, Any]] = self.manifest["scenes"]
+        self.wavelengths = torch.tensor(self.manifest["wavelengths_nm"], dtype=torch.float64) * nm
+        self._ends = list(accumulate(record["count"] for record in self.scenes))
+        self._arrays: dict[int, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, index: int) -> Patch:
+        place, number = self._place(index)
+        record = self.scenes[place]
+        if place not in self._arrays:
+            self._arrays[place] = scene_array(self.folder, self.manifest, record)
+        numbers = self._arrays[place][number]
+        values = torch.from_numpy(numbers.astype(np.float32)) * record["scale"]
+        return Patch(values, self.wavelengths, record["scene"])
+
+    def position(self, index: int) -> tuple[str, int, int]:
+        """Where a patch was cut: (scene, y, x) of its top left pixel."""
+        place, number = self._place(index)
+        y, x = self.scenes[place]["positions"][number]
+        return self.scenes[place]["scene"], y, x
+
+    @property
+    def mean(self) -> Tensor:
+        """Of each band over the split, (L,) float64."""
+        return torch.tensor(self.manifest["mean"], dtype=torch.float64)
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviation of each band over the split, (L,) float64."""
+        return torch.tensor(self.manifest["deviation"], dtype=torch.float64)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_arrays": {}}
+
+    def _place(self, index: int) -> tuple[int, int]:
+        count = len(self)
+        if not -count <= index < count:
+            raise IndexError(f"patch {index} of {count}.")
+        index = int(index) % count
+        place = bisect.bisect_right(self._ends, index)
+        return place, index - (self._ends[place - 1] if place else 0)
