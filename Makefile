@@ -1,4 +1,4 @@
-# make demo | test | test-all | bench | bench-peers | check | wheel-test | clean.   All is installed into .venv, once.
+# make demo | demo-data | test | test-all | bench | bench-peers | check | wheel-test | clean.   All is installed into .venv, once.
 PYTHON ?= python3
 VENV ?= .venv
 PEERS ?= .venv-peers
@@ -10,7 +10,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all bench bench-peers lint types check wheel-test clean
+.PHONY: help demo demo-data test test-slow test-all bench bench-peers lint types check wheel-test clean
 
 help:
 	@head -1 Makefile
@@ -28,6 +28,15 @@ $(VENV)/dev.stamp: $(VENV)/core.stamp
 
 demo: $(VENV)/core.stamp
 	$(BIN)/kcam demo --out demo/
+
+# A set of cubes from the built-in scenes, a look at them, and a patch store: what data_tools/ is for.
+demo-data: $(VENV)/dev.stamp
+	rm -rf demo-data
+	$(BIN)/python data_tools/demo_cubes.py --out demo-data/cubes
+	$(BIN)/python data_tools/inspect_cubes.py demo-data/cubes --out demo-data/report
+	$(BIN)/python data_tools/extract_patches.py demo-data/cubes --size 128 --stride 64 --out demo-data/patches \
+	    --split 0.7/0.3 --workers 2
+	$(BIN)/python data_tools/verify_patches.py demo-data/patches
 
 test: $(VENV)/dev.stamp
 	$(PYTEST) -m "not slow"
@@ -75,4 +84,4 @@ wheel-test: $(VENV)/core.stamp
 	rm -rf .wheel-test
 
 clean:
-	rm -rf $(VENV) $(PEERS) .wheel-test build dist demo
+	rm -rf $(VENV) $(PEERS) .wheel-test build dist demo demo-data

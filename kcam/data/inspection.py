@@ -18,7 +18,7 @@ from kcam.units import nm
 
 LOOKED_AT = 2**18  # pixels of a cube, at most: an even grid of whole rows and columns
 _UNLIKE = 0.5  # correlation with the neighbouring bands below which a band is bad
-_HOT = 12.0  # robust standard deviations from the median of its neighbours, at which a pixel is bad
+_HOT = 12.0  # robust standard deviations from the bands beside it, at which a value is bad
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Findings:
 
     low, middle, high: 1st, 50th and 99th percentile of the values. top: the largest. stops: log2 of the 99.9th over
     the noise, or over the 0.1th percentile where there is no noise. negative, clipped, invalid: shares of the values,
-    values, and pixels. noise: robust deviation from the neighbours' median, relative to the middle. bad_bands: places of
-    bands that are constant or unlike their neighbours. bad_pixels: values far from their neighbours', as a share.
+    and pixels. noise: robust deviation from the neighbours' median, relative to the middle. bad_bands: places of bands
+    that are constant or unlike their neighbours. bad_pixels: share of values unlike those of the bands beside them.
     spectrum: mean of each band.
     """
 
@@ -77,7 +77,7 @@ def inspect(path: Path) -> tuple[Findings, Tensor, np.ndarray]:
     bands = len(values)
     inside = values[:, valid] if valid.any() else values.reshape(bands, -1)
     percentiles = np.percentile(inside, (0.1, 1, 50, 99, 99.9))
-    noise, hot = _noise(values, valid)
+    noise = _noise(values, valid)
     floor = max(noise, float(percentiles[0]), 1e-9)
     top = float(inside.max())
     findings = Findings(
@@ -96,7 +96,7 @@ def inspect(path: Path) -> tuple[Findings, Tensor, np.ndarray]:
         invalid=float(1 - valid.mean()),
         noise=noise / max(float(percentiles[2]), 1e-9),
         bad_bands=tuple(_bad_bands(inside)),
-        bad_pixels=hot,
+        bad_pixels=_hot(inside),
         extrapolated=() if source.extrapolated is None else tuple(np.flatnonzero(source.extrapolated).tolist()),
         spectrum=tuple(inside.mean(1).tolist()),
     )
@@ -113,20 +113,25 @@ def _sample(source: Source) -> tuple[np.ndarray, np.ndarray]:
     return values, np.ones(values.shape[1:], bool) if valid is None else valid
 
 
-def _noise(values: np.ndarray, valid: np.ndarray) -> tuple[float, float]:
-    """(robust deviation of values from the median of their 3 x 3 neighbours, share of values far from it)."""
+def _noise(values: np.ndarray, valid: np.ndarray) -> float:
+    """Robust deviation of values from the median of their 3 x 3 neighbours: of the quietest half of the bands."""
     import cv2
 
-    if min(values.shape[1:]) < 3:
-        return 0.0, 0.0
-    deviations, hot = [], []
-    for plane in values:
-        difference = (plane - cv2.medianBlur(np.ascontiguousarray(plane), 3))[valid]
-        deviation = 1.4826 * float(np.median(np.abs(difference))) if difference.size else 0.0
-        deviations.append(deviation)
-        level = max(deviation, 0.01 * float(np.abs(plane).mean()))
-        hot.append(float((np.abs(difference) > _HOT * max(level, 1e-12)).mean()) if difference.size else 0.0)
-    return float(np.median(deviations)), float(np.mean(hot))
+    if min(values.shape[1:]) < 3 or not valid.any():
+        return 0.0
+    differences = [(plane - cv2.medianBlur(np.ascontiguousarray(plane), 3))[valid] for plane in values]
+    return 1.4826 * float(np.median([np.median(np.abs(difference)) for difference in differences]))
+
+
+def _hot(values: np.ndarray) -> float:
+    """Share of values far from the mean of the bands beside them, where spectra are smooth: hot and dead pixels."""
+    if len(values) < 3:
+        return 0.0
+    residual = values[1:-1] - (values[:-2] + values[2:]) / 2
+    deviation = 1.4826 * np.median(np.abs(residual - np.median(residual, axis=1, keepdims=True)), axis=1)
+    level = np.maximum(_HOT * deviation, 0.2 * np.abs(values).mean())[:, None]
+    beside = np.maximum(np.abs(values[1:-1]), (np.abs(values[:-2]) + np.abs(values[2:])) / 2)
+    return float((np.abs(residual) > np.maximum(level, 0.5 * beside)).mean())
 
 
 def _bad_bands(values: np.ndarray) -> list[int]:
@@ -164,9 +169,9 @@ def figures(found: list[tuple[Findings, Tensor, np.ndarray]]) -> dict[str, Any]:
     """Matplotlib figures by name: the contact sheet, and the spectra."""
     from matplotlib.figure import Figure
 
-    columns = min(6, max(1, len(found)))
+    columns = min(4, max(1, len(found)))
     rows = -(-len(found) // columns)
-    sheet = Figure(figsize=(2.1 * columns + 0.3, 2.2 * rows + 0.3), layout="constrained")
+    sheet = Figure(figsize=(2.4 * columns + 0.3, 2.5 * rows + 0.4), layout="constrained")
     curves = Figure(figsize=(2.6 * columns + 0.3, 2.0 * rows + 0.3), layout="constrained")
     for place, (findings, picture, spectra) in enumerate(found):
         axes = sheet.add_subplot(rows, columns, place + 1)
