@@ -28,19 +28,6 @@ grids = st.lists(st.integers(3600, 8300), min_size=1, max_size=40, unique=True)
 
 
 @pytest.fixture(scope="session")
-def tables() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_tables", Path(__file__).parents[1] / "tools" / "make_tables.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="session")
-def colour(tables: ModuleType) -> ModuleType:
-    return tables.import_colour()
-
-
-@pytest.fixture(scope="session")
 def observer(colour: ModuleType):
     return colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
 
