@@ -62,9 +62,7 @@ def imaged(
 ) -> Tensor:
     """Linear light (1,C,H,W) through a lens, with the window and the pixels of an augmentation."""
     window = {"psf_shape": augmentation.psf_shape((light.shape[-2], light.shape[-1]), wavelengths)} | options
-    stage = optics.Imaging(
-        lens, pixel_pitch=augmentation.pixel_pitch, propagator="fresnel", renormalise=True, **window
-    )
+    stage = optics.Imaging(lens, pixel_pitch=augmentation.pixel_pitch, propagator="fresnel", renormalise=True, **window)
     return stage(Scene.from_bands(light, wavelengths=wavelengths, depth=depth))
 
 

@@ -204,9 +204,7 @@ class TestAberration:
             direction = drawn["direction"][index].double()
             noll = torch.zeros(15, dtype=torch.float64)
             noll[3:] = direction / direction.norm() * drawn["rms"][index] * 550 * nm
-            lens = round_lens(
-                augmentation.focal_length, row(drawn, index)["f_number"], optics.ZernikeAberration(noll)
-            )
+            lens = round_lens(augmentation.focal_length, row(drawn, index)["f_number"], optics.ZernikeAberration(noll))
             return imaged(lens, light, augmentation=augmentation, wavelengths=wavelengths_for(channels))
 
         agree_row_by_row(augmentation, picture(2, channels, 30, 33), by_hand, bound=SAMPLINGS)
@@ -251,6 +249,7 @@ class TestAberration:
         outside = 1 - psfs.sum((-2, -1)).flatten()
         # nine of ten: at most a tenth above the 1 % asked for; nothing bounds a draw whose modes are steep at one place
         assert float(outside.sort().values[17]) < 1.1 * augmentation.outside
+
 
 class TestChromaticAberration:
     @CHANNELS
