@@ -183,6 +183,19 @@ class TestDefocus:
             # the window is the same; the tables of a batch are as fine as its worst needs, each good to 5e-5
             assert relative(together[index : index + 1], alone) < SAMPLINGS
 
+    def test_rows_that_were_not_drawn_keep_their_maps_to_themselves(self) -> None:
+        signal = picture(6, 3, 12, 13)
+        inverse = picture(6, 1, 12, 13, seed=1)
+        half, full = KC.RandomDefocus(p=0.5), KC.RandomDefocus(p=1.0)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            result = half(signal, inverse_depth=inverse)
+        gate = half._params["batch_prob"] > 0.5
+        assert 0 < gate.sum() < 6
+        everywhere = full(signal, inverse_depth=inverse, params=half._params)
+        assert torch.equal(result[~gate], signal[~gate])
+        assert (result[gate] - everywhere[gate]).abs().max() < 1e-12
+
 
 @CHANNELS
 def test_diffraction_is_imaging_with_a_stopped_down_lens(channels: int) -> None:
