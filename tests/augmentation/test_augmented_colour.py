@@ -12,8 +12,10 @@ from torch import Tensor
 
 import kcam.augmentation as KC
 from kcam import isp, spectral
-from kcam.augmentation.isp import DAYLIGHT, planck_ratio
+from kcam.augmentation.isp import planck_ratio
 from kcam.units import nm, wavelength_grid
+
+DAYLIGHT = 6504.0  # K, the correlated colour temperature of D65 in CIE 15
 
 
 def planck(wavelengths: Tensor, temperature: float) -> Tensor:

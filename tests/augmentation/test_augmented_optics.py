@@ -449,6 +449,18 @@ def test_the_ends_of_what_may_be_asked_for(extreme: KC.CameraAugmentation) -> No
         assert torch.allclose(light.mean((2, 3)), in_light(signal).mean((2, 3)), rtol=0.1)
 
 
+@pytest.mark.xfail(
+    strict=True,
+    raises=ValueError,
+    reason="batch_psf refuses the Hankel table of a PSF of thousands of fringes: which draws fail is a matter of chance",
+)
+def test_a_full_frame_lens_wide_open() -> None:
+    """50 mm with 6 um pixels, focused on 0.5 m and looking at 5 m: a blur of 520 pixels, cut to the picture's 257."""
+    augmentation = KC.RandomDefocus(0.5, 1.4, distance=5.0, focal_length=50 * mm, pixel_pitch=6 * um, p=1.0)
+    result, _ = augmented(augmentation, picture(1, 3, 256, 256, dtype=torch.float32))
+    assert result.isfinite().all()
+
+
 def gradcheck_simulate(augmentation: KC.CameraAugmentation, signal: Tensor, drawn: dict[str, Tensor], **bounds) -> None:
     """Of a weighted mean, with respect to the light and to every drawn number that is not a whole one."""
     smooth = {name: value for name, value in drawn.items() if value.is_floating_point()}
