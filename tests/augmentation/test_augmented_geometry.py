@@ -129,10 +129,20 @@ def test_a_box_holds_its_moved_edges(lens: dict[str, float], shape: tuple[int, i
         assert np.abs(own - box_around(moved)).max() < 0.1
 
 
-@pytest.mark.parametrize("lens", [{"k1": -1.5}, {"k1": -10.0}, {"k1": 0.0, "k2": -5.0}, {"p1": 3.0}])
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"k1": -1.5},
+        {"k1": -10.0},
+        {"k1": 0.0, "k2": -5.0},
+        {"p1": 3.0},
+        # decentred so far that corners and middles of the sides converge, and points between them do not
+        {"k1": -0.6396, "k2": 0.6052, "p1": -0.149, "p2": 0.126, "focal_length": 1.1152},
+    ],
+)
 def test_a_picture_that_folds_is_refused(lens: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="fold the picture over itself, or nearly so"):
-        KC.RandomLensDistortion(**lens, p=1.0)(torch.rand(1, 3, 40, 40))
+        KC.RandomLensDistortion(**lens, p=1.0)(torch.rand(1, 3, 48, 64))
 
 
 def test_no_distortion_is_the_identity() -> None:

@@ -452,7 +452,7 @@ def test_the_ends_of_what_may_be_asked_for(extreme: KC.CameraAugmentation) -> No
 @pytest.mark.xfail(
     strict=True,
     raises=ValueError,
-    reason="batch_psf refuses the Hankel table of a PSF of thousands of fringes: which draws fail is a matter of chance",
+    reason="batch_psf refuses the Hankel table of a PSF of thousands of fringes, for some draws and not for others",
 )
 def test_a_full_frame_lens_wide_open() -> None:
     """50 mm with 6 um pixels, focused on 0.5 m and looking at 5 m: a blur of 520 pixels, cut to the picture's 257."""
