@@ -76,8 +76,8 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
                 k1, k2, p1, p2 = coefficients[bad][0].tolist()
                 raise ValueError(
                     f"k1 = {k1:.3g}, k2 = {k2:.3g}, p1 = {p1:.3g}, p2 = {p2:.3g} fold the picture over itself, or "
-                    f"nearly so: some pixels have no one point that is imaged there. Use coefficients of half the size, "
-                    f"or focal_length={1.5 * self.focal_length:.3g}."
+                    f"nearly so: some pixels have no one point that is imaged there. Use coefficients of half the "
+                    f"size, or focal_length={1.5 * self.focal_length:.3g}."
                 )
         return drawn
 
