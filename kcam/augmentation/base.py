@@ -1,8 +1,9 @@
 """What all camera augmentations share: pictures in linear light, work for drawn rows only, noise from seeds.
 
 A tensor of 3 channels (or 1, gray) is a *picture*: sRGB, coded, in [0,1]. It is taken to linear light, and back, where
-the physics needs it; the result lies in [0,1]. Any other number of channels is a *cube*: spectral bands of linear light
-on which a perfect white is 1, from 420 to 720 nm in equal steps unless `wavelengths` says otherwise.
+the physics needs it; the result lies in [0,1]. Any other number of channels is a *cube*: spectral bands of light, from
+420 to 720 nm in equal steps unless `wavelengths` says otherwise. A perfect white has the spectrum of daylight with
+Y = 1, as in `Scene.from_bands`: about 1 in each band, not 1.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from kcam.augmentation.draws import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
 _ITERATIONS = 40  # of the inverse, a fixed point, at most
-_TOLERANCE = 0.01  # of the inverse at the picture's border, where it converges last [pixels]
+_TOLERANCE = 0.01  # of the inverse, at probes all over the picture [pixels]
 _EDGE_SAMPLES = 9  # of a box's edge: a straight edge becomes a curve
 
 
@@ -35,7 +35,7 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
                focal_length: of the lens in units of the picture's longer side; 1 is a field of 53 degrees.
                resample: of the picture, "bilinear" or "nearest".
     Raises:    ValueError at the call where the drawn coefficients fold the picture over itself, or nearly so (the
-        inverse does not converge to 0.01 pixels at the border).
+        inverse does not converge to 0.01 pixels).
     Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
     """
 
@@ -68,16 +68,16 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         if batch_shape[0] and not torch.compiler.is_compiling():
             with torch.no_grad():
                 camera, coefficients = self._lens(drawn, (height, width), torch.device("cpu"))
-                border = _border((height, width)).expand(len(coefficients), -1, -1)
-                ideal = undistort_points(border, camera, coefficients, num_iters=_ITERATIONS)
-                missed = (distort_points(ideal, camera, coefficients) - border).abs().amax((1, 2))
+                probes = _probes((height, width)).expand(len(coefficients), -1, -1)
+                ideal = undistort_points(probes, camera, coefficients, num_iters=_ITERATIONS)
+                missed = (distort_points(ideal, camera, coefficients) - probes).abs().amax((1, 2))
             bad = ~(missed < _TOLERANCE)
             if bad.any():
                 k1, k2, p1, p2 = coefficients[bad][0].tolist()
                 raise ValueError(
                     f"k1 = {k1:.3g}, k2 = {k2:.3g}, p1 = {p1:.3g}, p2 = {p2:.3g} fold the picture over itself, or "
-                    f"nearly so: its border has no one point that is imaged there. Use coefficients of half the size, "
-                    f"or focal_length={1.5 * self.focal_length:.3g}."
+                    f"nearly so: some pixels have no one point that is imaged there. Use coefficients of half the "
+                    f"size, or focal_length={1.5 * self.focal_length:.3g}."
                 )
         return drawn
 
@@ -171,18 +171,18 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
 
 @torch.no_grad()
 def _iterations(shape: tuple[int, int], camera: Tensor, coefficients: Tensor) -> int:
-    """Of the inverse, until the picture's border, where it converges last, is good to 1e-4 pixels."""
-    border = _border(shape).to(camera.device).expand(len(coefficients), -1, -1)
-    last = border
+    """Of the inverse, until all probes are good to 1e-4 pixels."""
+    probes = _probes(shape).to(camera.device).expand(len(coefficients), -1, -1)
+    last = probes
     for count in range(4, _ITERATIONS, 4):
-        here = undistort_points(border, camera, coefficients, num_iters=count)
+        here = undistort_points(probes, camera, coefficients, num_iters=count)
         if float((here - last).abs().max()) < 1e-4:
             return count
         last = here
     return _ITERATIONS
 
 
-def _border(shape: tuple[int, int]) -> Tensor:
-    """Corners and middles of a picture's sides, (9, 2) as x, y."""
+def _probes(shape: tuple[int, int]) -> Tensor:
+    """Points of a picture's sides and of its inside, (81, 2) as x, y: decentred, a lens is at its worst anywhere."""
     height, width = shape
-    return torch.cartesian_prod(*(torch.linspace(0, n - 1, 3, dtype=torch.float64) for n in (width, height)))
+    return torch.cartesian_prod(*(torch.linspace(0, n - 1, 9, dtype=torch.float64) for n in (width, height)))

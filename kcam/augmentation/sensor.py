@@ -23,8 +23,9 @@ BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
 class RandomBayer(CameraAugmentation):
     """Mosaic and demosaic: what a sensor of one colour per pixel loses.
 
-    A picture is mosaiced in linear light and filled in again. A cube of bands becomes a picture: through the colour
-    filter, the mosaic and the demosaic, white balance, colour matrix and tone curve of a noiseless camera.
+    A picture is mosaiced in linear light and filled in again, on its square root as by `isp.demosaic`. A cube of bands
+    becomes a picture: through the colour filter, the mosaic and the demosaic, white balance, colour matrix and tone
+    curve of a noiseless camera.
 
     Args:      pattern: "random" for one of the four phases of the Bayer pattern, a name in `sensor.PATTERNS` (of three
                    channels on pictures), or several names.
