@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 import torch
+from scipy.special import fresnel
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from kcam.optics import sampling
 from kcam.optics.elements import zernike_sum
@@ -19,7 +19,8 @@ from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 
 _STEP = math.pi / 24  # of t in the table of J0: |U|^2 by cubic interpolation is then good to 1e-4 of its fringes
 _PROFILE_STEPS = 16  # of the profile for each of its fringes; cubic between them
-_KEPT_TABLE, _LARGEST_TABLE = 2**22, 2**31  # entries: 34 MB; a minute
+_KEPT_TABLE = 2**22  # entries of a table of J0: 34 MB
+_MOST_FRINGES = 2**20
 
 
 def batch_psf(
@@ -167,17 +168,13 @@ def _radial_bank(
         per_pixel = 2 ** max(3, math.ceil(math.log2(_PROFILE_STEPS * fastest / math.pi)))
         corner = math.sqrt(2) * (half + 0.5)
         nodes, arguments = _rounded((fastest * corner + defocus) / 2 + 32), _rounded(fastest * corner / _STEP + 8)
-    if nodes * arguments > _LARGEST_TABLE:
+    if max(nodes, arguments) > _MOST_FRINGES:
         raise ValueError(
-            f"this batch needs a Hankel table of {nodes} x {arguments}, more than {_LARGEST_TABLE} numbers: the PSF is "
-            "thousands of fringes wide. Use a smaller shape, larger f-numbers or distances nearer to the focus."
+            f"this batch needs {max(nodes, arguments)} samples of the pupil and the PSF, more than {_MOST_FRINGES}: it "
+            "has that many fringes. Use a smaller shape, larger f-numbers or distances nearer to the focus."
         )
-    rho, weights = (torch.as_tensor(value, device=residual.device) for value in legendre(nodes))
-    rho, weights = (rho + 1) / 2, weights / 2
-    phase = (wavenumbers[:, None] * residual.transpose(1, 2) * (a[:, None, None] ** 2 / 2))[..., None] * rho**2
-    amplitude = 2 * rho * weights  # (B, L, Z, n) below
-    field = torch.stack([phase.cos(), phase.sin()]) * amplitude
-    intensity = _hankel(field, rho, arguments).square().sum(0)  # (B, L, Z, T)
+    rim = wavenumbers[:, None] * residual.transpose(1, 2) * (a[:, None, None] ** 2 / 2)  # (B, L, Z)
+    intensity = _amplitude(rim, nodes=nodes, arguments=arguments).square().sum(0)  # (B, L, Z, T)
     steps = torch.arange(math.ceil(corner * per_pixel) + 3, dtype=torch.float64, device=residual.device)
     position = scales[..., None] * (steps * (pixel_pitch / per_pixel / _STEP))  # (B, L, R)
     low = torch.clamp(position.detach().floor().long(), max=arguments - 3)
@@ -201,19 +198,63 @@ def _rounded(count: float) -> int:
     return int(step * math.ceil(count / step))
 
 
-def _hankel(field: Tensor, rho: Tensor, arguments: int) -> Tensor:
-    """SUM field J0(t rho) at t = 0, _STEP, ...: (..., n) to (..., T). Small tables are kept, others made in parts."""
-    nodes = len(rho)
-    if nodes * arguments <= _KEPT_TABLE:
-        return field @ _bessel_table(nodes, arguments, field.device)
+def _amplitude(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
+    """U = 2 INT_0^1 exp(i w rho^2) J0(t rho) rho d rho at t = 0, _STEP, ...: w (...) [rad] at the rim to (2, ..., T).
 
-    def part(field: Tensor, first: int, last: int) -> Tensor:
-        t = torch.arange(first, last, dtype=torch.float64, device=field.device) * _STEP
-        return field @ torch.special.bessel_j0(rho[:, None] * t)
+    By Gauss-Legendre and a table of J0 that is kept, or, where that would be too large, through the projection.
+    """
+    if nodes * arguments > _KEPT_TABLE:
+        return _projected(rim, nodes=nodes, arguments=arguments)
+    rho, weights = (torch.as_tensor(value, device=rim.device) for value in legendre(nodes))
+    rho = (rho + 1) / 2
+    phase = rim[..., None] * rho**2
+    return torch.stack([phase.cos(), phase.sin()]) * (rho * weights) @ _bessel_table(nodes, arguments, rim.device)
 
-    step = max(1, _KEPT_TABLE // nodes)
-    ends = [(first, min(first + step, arguments)) for first in range(0, arguments, step)]
-    return torch.cat([checkpoint(part, field, *end, use_reentrant=False) for end in ends], dim=-1)
+
+def _projected(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
+    """The same by the projection-slice theorem: one FFT for each PSF, however many fringes it has.
+
+    U(t) = 1 / pi INT_-1^1 exp(i t x + i w x^2) 2 E(sqrt(1 - x^2)) dx,   E(Y) = INT_0^Y exp(i w y^2) dy, Fresnel's
+
+    The trapezium rule errs by the 1.5th power of its step, where the disc's projection ends like a root: 1e-6 here.
+    """
+    count = 2 ** math.ceil(math.log2(max(4 * nodes, 2 * arguments, 2**12) * 2 * math.pi / _STEP / 2))
+    step = 2 * math.pi / (_STEP * count)
+    half = math.floor(1 / step)
+    x = torch.arange(-half, half + 1, dtype=torch.float64, device=rim.device) * step
+    chord = torch.sqrt(torch.clamp(1 - x**2, min=0))
+    parts = []
+    for one in rim.flatten():  # one at a time: each takes megabytes
+        phase = one * x**2
+        wave = torch.complex(phase.cos(), phase.sin()) * _Fresnel.apply(one, chord)
+        padded = torch.nn.functional.pad(wave, (0, count - len(x)))
+        # the origin of x stands at place `half`: a shift by it is a phase
+        shift = torch.arange(arguments, dtype=torch.float64, device=rim.device) * (2 * math.pi * half / count)
+        spectrum = torch.fft.ifft(padded)[:arguments] * torch.complex(shift.cos(), -shift.sin())
+        parts.append(spectrum * (2 * step * count / math.pi))
+    return torch.view_as_real(torch.stack(parts)).movedim(-1, 0).unflatten(1, rim.shape)
+
+
+class _Fresnel(torch.autograd.Function):
+    """E(w, Y) = INT_0^Y exp(i w y^2) dy, with its derivative (Y exp(i w Y^2) - E) / 2 w to w."""
+
+    @staticmethod
+    def forward(ctx, rim, chord):
+        scale = math.sqrt(2 * max(abs(float(rim)), 1e-12) / math.pi)
+        sine, cosine = (torch.as_tensor(part, device=chord.device) for part in fresnel(chord.cpu().numpy() * scale))
+        result = torch.complex(cosine, sine if rim > 0 else -sine) / scale
+        ctx.save_for_backward(rim, chord, result)
+        return result
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        rim, chord, result = ctx.saved_tensors
+        phase = rim * chord**2
+        slope = torch.complex(torch.zeros_like(chord), chord**3 / 3)  # its limit in focus
+        if abs(float(rim)) > 1e-4:
+            slope = (chord * torch.complex(phase.cos(), phase.sin()) - result) / (2 * rim)
+        return (grad.conj() * slope).real.sum(), None
 
 
 @functools.lru_cache(maxsize=12)
