@@ -105,7 +105,8 @@ class RandomCamera(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Row by row, each with its own camera, distance and seed."""
-        depths: Sequence[float | Tensor] = drawn["distance"].tolist()
+        distance = drawn["distance"]
+        depths: Sequence[float | Tensor] = distance.unbind() if distance.requires_grad else distance.tolist()
         mapped = "inverse_depth" in drawn
         if mapped:
             vergence = check_inverse_depth(drawn["inverse_depth"], signal).double().clamp(min=_NEAREST_VERGENCE)
