@@ -75,10 +75,14 @@ class RandomBlur(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """One depth: each channel of each sample with its PSF."""
+        return convolve(signal, self.kernels(signal, drawn)[:, 0])
+
+    @torch.compiler.disable  # its sizes follow from numbers, at each of which a graph would break
+    def kernels(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """The PSFs for a signal, (B, Z, L, h, w)."""
         wavelengths = wavelengths_of(signal, self.wavelengths)
         shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
-        psfs = self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
-        return convolve(signal, psfs[:, 0])
+        return self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
 
 
 def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
