@@ -718,6 +718,15 @@ class TestDepth:
             # A camera ends in an ADC of 10 bits: one step of it where rounding falls the other way.
             torch.testing.assert_close(mapped, expected, atol=1e-5 if name == "defocus" else 5e-3, rtol=0)
 
+    def test_a_map_beyond_the_range_of_distances(self) -> None:
+        # The window of the PSFs is that of the map: 35 pixels here, where the range would give 13.
+        x = picture(2, 3, 41, 41)
+        lens = {"focus": 2.0, "f_number": 2.0, "p": 1.0}
+        expected = KC.RandomDefocus(distance=0.3, **lens)(x)
+        near = torch.full((2, 1, 41, 41), 1 / 0.3)
+        mapped = KC.RandomDefocus(distance=(1.8, 2.2), **lens)(x, inverse_depth=near)
+        torch.testing.assert_close(mapped, expected, atol=1e-5, rtol=0)
+
     @pytest.mark.parametrize("name", ["defocus", "camera"])
     def test_rows_and_replay(self, name: str) -> None:
         augment = BY_NAME[name](p=0.5)
