@@ -143,12 +143,13 @@ class CameraSequential(K.AugmentationSequential):
 
     def forward(self, *args: Any, params: list[ParamItem] | None = None, data_keys: Any = None) -> Any:
         """As `K.AugmentationSequential`."""
-        names = list(args[0]) if len(args) == 1 and isinstance(args[0], dict) else None
-        self.transform_op.names = names
-        try:
-            return super().forward(*args, params=params, data_keys=data_keys)
-        finally:
-            self.transform_op.names = None
+        self.transform_op.names = []
+        return super().forward(*args, params=params, data_keys=data_keys)
+
+    def _preproc_dict_data(self, data: dict[str, Any]) -> Any:
+        prepared = super()._preproc_dict_data(data)
+        self.transform_op.names = list(prepared[0])  # without the keys that Kornia passes through: places count
+        return prepared
 
 
 class _Ops(AugmentationSequentialOps):
@@ -157,7 +158,7 @@ class _Ops(AugmentationSequentialOps):
     def __init__(self, data_keys: list[DataKey] | None, owner: CameraSequential) -> None:
         super().__init__(data_keys)
         self.owner = [owner]  # in a list: a module in an attribute would be its child
-        self.names: list[str] | None = None
+        self.names: list[str] = []
 
     def transform(self, *arg: Any, module: nn.Module, param: ParamItem, extra_args: Any, data_keys: Any = None) -> Any:
         owner = self.owner[0]
@@ -189,7 +190,7 @@ class _Ops(AugmentationSequentialOps):
             index = masks[0]
         else:
             if isinstance(wanted, str):
-                index = (self.names or []).index(wanted) if wanted in (self.names or []) else -1
+                index = self.names.index(wanted) if wanted in self.names else -1
             else:
                 index = wanted
             if index not in masks:
