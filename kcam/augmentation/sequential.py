@@ -125,7 +125,14 @@ class CameraSequential(K.AugmentationSequential):
         return not isinstance(module, (_AugmentationBase, K.MixAugmentationBaseV2, ImageSequentialBase))
 
     def run(self, module: nn.Module, input: Tensor, *, depth: Tensor | None) -> Tensor:
-        """A plain module; a stage is told of its neighbours, and an Imaging of the depth."""
+        """A plain module; a stage is told of its neighbours, and an Imaging of the depth.
+
+        A picture (C,H,W) or (H,W), which no augmentation has yet made a batch of, is one for as long.
+        """
+        if input.ndim < 4:
+            result = self.run(module, input.reshape((1,) * (4 - input.ndim) + input.shape), depth=depth)
+            alone = result[0]
+            return alone[0] if input.ndim == 2 and alone.shape[0] == 1 else alone
         channels = input.shape[1]
         if isinstance(module, Stage):
             context = self.context()
