@@ -101,7 +101,7 @@ CASES: tuple[Case, ...] = (
         LENS,
     ),
     Case("diffraction", KC.RandomDiffraction, {"f_number": (16.0, 32.0)}, LENS),
-    Case("aberration", KC.RandomAberration, {"rms": (0.2, 0.4), "f_number": (4.0, 8.0)}, LENS),
+    Case("aberration", KC.RandomAberration, {"rms": (0.1, 0.2), "f_number": (6.0, 9.0)}, LENS),
     Case(
         "chromatic_aberration",
         KC.RandomChromaticAberration,

@@ -70,6 +70,17 @@ def test_takes_what_kornia_takes() -> None:
         torch.testing.assert_close(y.double().reshape(expected.shape), expected, atol=1e-6, rtol=0)
 
 
+def test_leaves_the_gpus_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Seeding them would reset the user's stream there, and in a forked worker fail.
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", lambda seed: pytest.fail("seeded the GPUs"))
+    KC.corrupt(photograph("coffee")[..., :16, :16], "shot_read_noise", severity=1)
+
+
+def test_a_whole_float_is_a_severity() -> None:
+    x = photograph("coffee")[..., :16, :16]
+    assert torch.equal(KC.corrupt(x, "vignetting", severity=2.0), KC.corrupt(x, "vignetting", severity=2))
+
+
 def test_each_row_of_a_batch_has_its_own_noise() -> None:
     x = photograph("coffee")[..., :16, :16].expand(2, -1, -1, -1)
     y = KC.corrupt(x, "shot_read_noise", severity=3)
