@@ -82,7 +82,7 @@ class TestShapes:
             torch.testing.assert_close(y.double(), expected, atol=4 * torch.finfo(dtype).eps + 1e-12, rtol=0)
 
     @table()
-    @pytest.mark.parametrize("shape", [(16, 9), (1, 13), (13, 1), (1, 1)], ids=str)
+    @pytest.mark.parametrize("shape", [(16, 9), (1, 13), (1, 1)], ids=str)
     def test_sizes(self, case: Case, shape: tuple[int, int]) -> None:
         for channels in case.channels():
             y = case(p=1.0)(picture(2, channels, *shape))
@@ -163,7 +163,9 @@ class TestReplay:
         "augmentation": lambda *stages: K.AugmentationSequential(*stages, data_keys=KEYS),
         "camera": lambda *stages: KC.CameraSequential(*stages, data_keys=KEYS, depth=False),
         "image in augmentation": lambda *stages: K.AugmentationSequential(K.ImageSequential(*stages), data_keys=KEYS),
-        "camera in augmentation": lambda *stages: K.AugmentationSequential(KC.CameraSequential(*stages), data_keys=KEYS),
+        "camera in augmentation": lambda *stages: K.AugmentationSequential(
+            KC.CameraSequential(*stages), data_keys=KEYS
+        ),
         "augmentation in camera": lambda *stages: KC.CameraSequential(
             K.AugmentationSequential(*stages), data_keys=KEYS, depth=False
         ),
@@ -176,7 +178,7 @@ class TestReplay:
         sequence = self.CONTAINERS[container](
             K.RandomHorizontalFlip(p=0.5), case(p=1.0 if case.name == "bayer" else 0.7), K.RandomGaussianNoise(p=0.5)
         )
-        inputs = (picture(4, 3, *SIZE), *annotated(4))
+        inputs = (picture(3, 3, *SIZE), *annotated(3))
         first = seeded(sequence, *inputs)
         params = sequence._params
         seeded(sequence, *inputs, seed=1)
@@ -185,15 +187,14 @@ class TestReplay:
             assert torch.equal(one, other)
 
     @table_of_channels()
-    @pytest.mark.parametrize("nested", [False, True], ids=["flat", "nested"])
-    def test_in_image_sequential(self, case: Case, channels: int, nested: bool) -> None:
+    def test_in_image_sequential(self, case: Case, channels: int) -> None:
         # K.RandomGaussianNoise draws a field of the shape that the container believes in: after 28 -> 3 it must be 3.
         stages: list[nn.Module] = [case(p=1.0), K.RandomGaussianNoise(p=1.0, std=0.1)]
-        sequence = K.ImageSequential(K.ImageSequential(*stages)) if nested else K.ImageSequential(*stages)
         x = picture(2, channels, *SIZE)
-        y = sequence(x)
-        assert y.shape == (2, case.channels_after(channels), *SIZE)
-        assert torch.equal(sequence(x, params=sequence._params), y)
+        for sequence in (K.ImageSequential(*stages), K.ImageSequential(K.ImageSequential(*stages))):
+            y = sequence(x)
+            assert y.shape == (2, case.channels_after(channels), *SIZE)
+            assert torch.equal(sequence(x, params=sequence._params), y)
 
     @table()
     def test_later_stages_cannot_break_it(self, case: Case) -> None:
@@ -467,11 +468,15 @@ class TestCopies:
     def test_planning_draws_nothing_of_the_stream(self) -> None:
         # The first picture of a size is planned for; the second is not: both must leave the stream at the same place.
         states = []
-        augment = BY_NAME["camera"].build(p=1.0, tolerance=0.03)
+        augment = BY_NAME["camera"].build(p=1.0, tolerance=0.02)
+        pictures = []
         for _ in range(2):
-            seeded(augment, picture(1, 3, 12, 12))
+            pictures.append(seeded(augment, picture(1, 3, 12, 12)))
             states.append(torch.get_rng_state())
         assert torch.equal(*states)
+        assert torch.equal(*pictures)
+        twin = pickle.loads(pickle.dumps(augment))  # which plans again
+        assert torch.equal(seeded(twin, picture(1, 3, 12, 12)), pictures[0])
 
     @table()
     def test_repr(self, case: Case) -> None:
@@ -602,10 +607,9 @@ class TestCompile:
         "name",
         [
             "vignetting",
-            "exposure",
             *(
-                pytest.param(name, marks=pytest.mark.slow)  # 2 to 6 s each
-                for name in ("tone_curve", "white_balance", "lens_distortion", "chromatic_aberration", "diffraction")
+                pytest.param(name, marks=pytest.mark.slow)  # 1 to 6 s each
+                for name in ("exposure", "tone_curve", "white_balance", "lens_distortion", "chromatic_aberration")
             ),
             "defocus",
         ],
@@ -650,7 +654,7 @@ class TestCompile:
         (lambda: KC.RandomDefocus(focus=(0.0, 1.0)), ValueError, r"focus must be .*0\.001 <= low.*got \(0, 1\)"),
         (lambda: KC.RandomDefocus(focus=(float("nan"), 1.0)), ValueError, r"focus must be .*got \(nan, 1\)"),
         (lambda: KC.RandomDefocus(f_number=(0.1, 8.0)), ValueError, r"f_number must be .*0\.5 <= low"),
-        (lambda: KC.RandomDefocus(focus=(0.005, 1.0)), ValueError, r"focus 0\.005 m is inside the focal length of 0\.008"),
+        (lambda: KC.RandomDefocus(focus=(0.005, 1.0)), ValueError, r"focus 0\.005 m is inside the focal length"),
         (lambda: KC.RandomDefocus(layers=0), ValueError, "layers must be a whole number of 1 or more, got 0"),
         (lambda: KC.RandomDefocus(layers=True), ValueError, "layers must be a whole number"),
         (lambda: KC.RandomDefocus(outside=0.0), ValueError, "outside must be a share of the light.*got 0"),

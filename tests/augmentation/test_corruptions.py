@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -19,9 +20,9 @@ SEEDED = ("aberration", "shot_read_noise", "fixed_pattern")
 
 @functools.cache
 def photograph(name: str) -> Tensor:
-    """A part of a photograph, 96 x 120, with detail and colours: (1,3,H,W)."""
-    whole = {"astronaut": data.astronaut, "coffee": data.coffee, "chelsea": data.chelsea}[name]()
-    return torch.tensor(whole[60:156, 180:300]).permute(2, 0, 1)[None] / 255
+    """A part of it, 80 x 100, with detail and colours: (1,3,H,W)."""
+    whole = {"astronaut": data.astronaut, "coffee": data.coffee}[name]()
+    return torch.tensor(whole[60:140, 180:280]).permute(2, 0, 1)[None] / 255
 
 
 def rms(name: str, severity: int, picture: Tensor) -> float:
@@ -45,9 +46,8 @@ def test_every_row(name: str, severity: int) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_higher_severity_is_worse(name: str) -> None:
-    pictures = [photograph(which) for which in ("astronaut", "coffee", "chelsea")]
-    errors = [sum(rms(name, severity, x) for x in pictures) / 3 for severity in (1, 2, 3, 4, 5)]
-    for milder, stronger in zip(errors[:-1], errors[1:], strict=True):
+    errors = [rms(name, severity, photograph("coffee")) for severity in (1, 2, 3, 4, 5)]
+    for milder, stronger in pairwise(errors):
         assert stronger > 1.02 * milder  # 2 %: a step that can be told
     assert errors[0] > 1 / 255  # of the range: less than a step of 8 bits on average is no corruption
 
