@@ -420,6 +420,22 @@ class TestDataKeys:
         assert (back - image).abs()[..., 8:-8, 8:-8].max() < 4 * 0.25 * (torch.pi / 8) ** 2 / 8
         assert (distorted - image)[drawn].abs()[..., 8:-8, 8:-8].amax((1, 2, 3)).min() > 0.1
 
+    def test_inverse_of_points_and_boxes(self) -> None:
+        sequence = K.AugmentationSequential(KC.RandomLensDistortion(k1=(-0.25, -0.2), p=0.5), data_keys=KEYS)
+        points = torch.tensor([[5.0, 6.0], [60.0, 40.0]]).repeat(4, 1, 1)
+        boxes = torch.tensor([[4.0, 5.0, 12.0, 14.0]]).repeat(4, 1, 1)
+        image = picture(4, 3, 48, 64)
+        out = seeded(sequence, image, image[:, :1], points, boxes)
+        drawn = sequence._params[0].data["batch_prob"] > 0.5
+        assert (out[2] - points)[drawn].abs().max() > 1
+        _, _, back, boxes_back = sequence.inverse(*out)
+        torch.testing.assert_close(back, points, atol=1e-3, rtol=0)
+        # The box around a bent box holds it, and no more than the bend of its edges, here some tenths of a pixel.
+        grown = torch.cat([boxes[..., :2] - boxes_back[..., :2], boxes_back[..., 2:] - boxes[..., 2:]], -1)
+        assert grown.min() > -1e-3
+        assert grown.max() < 0.5
+        assert torch.equal(back[~drawn], points[~drawn])
+
     def test_lens_distortion_no_points(self) -> None:
         sequence = K.AugmentationSequential(KC.RandomLensDistortion(p=1.0), data_keys=["input", "keypoints"])
         _, points = sequence(picture(), torch.zeros(2, 0, 2))
