@@ -15,6 +15,7 @@ from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
 from kcam.augmentation.optics import check_inverse_depth
 from kcam.augmentation.sensor import announced
 from kcam.camera import PRESETS, Camera
+from kcam.planner.making import check_tolerance
 from kcam.scene import Scene
 from kcam.ste import clip_ste
 from kcam.units import wavelength_grid
@@ -60,6 +61,7 @@ class RandomCamera(CameraAugmentation):
             cameras = [cameras]
         if not cameras:
             raise ValueError('cameras is empty: give at least one, such as cameras=["phone"].')
+        check_tolerance(tolerance)
         draws: dict[str, Draw] = {
             "camera": Choice(len(cameras)),
             "distance": Uniform(distance, "vergence", least=1e-2, unit="[m]"),

@@ -153,7 +153,8 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         corners = input.data  # (B, N, 4, 2) in turn around the box
         share = torch.linspace(0, 1, _EDGE_SAMPLES, dtype=corners.dtype, device=corners.device)[:, None]
         edges = corners[..., None, :] + (corners.roll(-1, dims=-2) - corners)[..., None, :] * share
-        moved = self._moved(edges.flatten(1, -2), params, inverse=inverse).to(corners.dtype).view(*edges.shape[:2], -1, 2)
+        moved = self._moved(edges.flatten(1, -2), params, inverse=inverse)
+        moved = moved.to(corners.dtype).view(*edges.shape[:2], -1, 2)
         (left, top), (right, bottom) = moved.amin(-2).unbind(-1), moved.amax(-2).unbind(-1)
         output = input.clone()
         output._data = torch.stack(

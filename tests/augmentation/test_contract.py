@@ -12,7 +12,7 @@ import kornia.augmentation as K
 import numpy as np
 import pytest
 import torch
-from cases import BY_NAME, CASES, SIZE, Case, Pictures, picture, pipeline
+from cases import BY_NAME, CASES, LENS, SIZE, Case, Pictures, picture, pipeline
 from PIL import Image
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -348,6 +348,14 @@ class TestGradients:
             bounds += 0.5
         with pytest.raises(ValueError, match=r"shade was trained or loaded to \(1, 1\.5\), outside 0 <= low"):
             augment(picture())
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16], ids=str)
+    def test_limits_in_other_types(self, dtype: torch.dtype) -> None:
+        # 0.49 rounds to more than the 0.49 that is allowed, and 0.2 too.
+        bounds = nn.Parameter(torch.tensor([-0.49, 0.49], dtype=dtype))
+        for augment in (KC.RandomToneCurve(contrast=bounds, p=1.0), KC.RandomToneCurve(contrast=(0.1, 0.49), p=1.0)):
+            assert augment.to(dtype)(picture()).isfinite().all()
+        assert KC.RandomChromaticAberration(lateral=0.2, p=1.0, **LENS).to(dtype)(picture()).isfinite().all()
 
     def test_loaded_bounds_count(self) -> None:
         # Kornia's own samplers keep the old range (#4428)
@@ -702,6 +710,9 @@ class TestCompile:
         (lambda: KC.RandomToneCurve(contrast=0.6), ValueError, "contrast must be .*high <= 0.49"),
         (lambda: KC.RandomToneCurve(gamma=0.0), ValueError, "gamma must be .*0.1 <= low"),
         (lambda: KC.RandomCamera(cameras=[]), ValueError, "cameras is empty"),
+        (lambda: KC.RandomCamera(tolerance=-1), ValueError, "tolerance must be a relative error >= 0.*got -1"),
+        (lambda: KC.RandomCamera(tolerance="sharp"), ValueError, 'unknown tolerance "sharp"'),
+        (lambda: KC.RandomBayer(pattern=[]), ValueError, "pattern is empty"),
         (lambda: KC.RandomCamera(cameras=["nokia"]), ValueError, "unknown camera 'nokia'. There are: thesis"),
         (lambda: KC.RandomCamera(distance=0.0), ValueError, r"distance must be .*\[m\] with 0.01 <= low"),
     ],
