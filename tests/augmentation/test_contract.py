@@ -759,6 +759,18 @@ class TestDepth:
         mapped = KC.RandomDefocus(distance=(1.8, 2.2), **lens)(x, inverse_depth=near)
         torch.testing.assert_close(mapped, expected, atol=1e-5, rtol=0)
 
+    def test_a_camera_is_planned_for_maps_beyond_its_range(self) -> None:
+        # With a plan for 1.9 to 2.1 m, or for the near one alone, one of these would keep its blur or get none: 0.1 of
+        # the range. What is left is noise, which a plan may draw in another order: 1 % of the range on average.
+        arguments = {"cameras": ["phone"], "distance": (1.9, 2.1), "p": 1.0}
+        planned, exact = (KC.RandomCamera(tolerance=tolerance, **arguments) for tolerance in (0.02, 0))
+        x = picture(1, 3, 24, 32)
+        for vergence in (0.5, 5.0, 4.0, 0.0):
+            depth = torch.full((1, 1, 24, 32), vergence)
+            y, expected = (seeded(augment, x, inverse_depth=depth) for augment in (planned, exact))
+            assert (y - expected).abs().mean() < 0.02
+        assert len(planned._planned) == 3  # of the range, up to 8 and up to 4 per metre: not one for each map
+
     @pytest.mark.parametrize("name", ["defocus", "camera"])
     def test_rows_and_replay(self, name: str) -> None:
         augment = BY_NAME[name](p=0.5)
