@@ -89,6 +89,16 @@ class TestShapes:
             assert y.shape == (2, case.channels_after(channels), *shape)
             assert y.isfinite().all()
 
+    @table()
+    def test_strides_do_not_matter(self, case: Case) -> None:
+        x = picture().transpose(-1, -2)
+        augment = case(p=1.0)
+        torch.testing.assert_close(seeded(augment, x), seeded(augment, x.contiguous()), atol=1e-6, rtol=0)
+
+    @table(lambda case: case.cubes)
+    def test_cubes_far_above_white_and_below_black(self, case: Case) -> None:
+        assert case(p=1.0)(picture(2, 28, *SIZE) * 50 - 10).isfinite().all()
+
     @table(lambda case: case.name != "camera")
     def test_odd_size_with_the_defaults(self, case: Case) -> None:
         y = case.build(p=1.0, **case.fixed)(picture(1, 3, 33, 47))
@@ -663,6 +673,7 @@ class TestCompile:
         torch.testing.assert_close(seeded(torch.compile(augment, backend="aot_eager"), x), expected, atol=1e-6, rtol=0)
 
     @pytest.mark.slow  # 30 s of C++ compiler
+    @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's own, where it imports inductor
     def test_inductor(self) -> None:
         torch.compiler.reset()
         augment = BY_NAME["vignetting"](p=1.0)
