@@ -108,18 +108,53 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         self, input: Keypoints, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Keypoints:
         """Each point to where the lens images it."""
-        output = input.clone()
-        output._data = self._moved(input.data, params).to(input.data.dtype)
-        return output
+        return self._moved_keypoints(input, params, inverse=False)
+
+    def inverse_keypoints(
+        self,
+        input: Keypoints,
+        params: dict[str, Tensor] | None,
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+        **kwargs,
+    ) -> Keypoints:
+        """Each point to where the ideal lens images it."""
+        params = self._params if params is None else params
+        moved = self._moved_keypoints(input, params, inverse=True)
+        moved._data = self._blend_by_prob(moved.data, input.data, self._gate(params))
+        return moved
+
+    def inverse_boxes(
+        self,
+        input: Boxes,
+        params: dict[str, Tensor] | None,
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+        **kwargs,
+    ) -> Boxes:
+        """The upright box around the edges where the ideal lens images them."""
+        params = self._params if params is None else params
+        moved = self._moved_boxes(input, params, inverse=True)
+        moved._data = self._blend_by_prob(moved.data, input.data, self._gate(params))
+        return moved
 
     def apply_transform_box(
         self, input: Boxes, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Boxes:
         """The upright box around the moved edges."""
+        return self._moved_boxes(input, params, inverse=False)
+
+    def _moved_keypoints(self, input: Keypoints, params: dict[str, Tensor], *, inverse: bool) -> Keypoints:
+        output = input.clone()
+        output._data = self._moved(input.data, params, inverse=inverse).to(input.data.dtype)
+        return output
+
+    def _moved_boxes(self, input: Boxes, params: dict[str, Tensor], *, inverse: bool) -> Boxes:
         corners = input.data  # (B, N, 4, 2) in turn around the box
         share = torch.linspace(0, 1, _EDGE_SAMPLES, dtype=corners.dtype, device=corners.device)[:, None]
         edges = corners[..., None, :] + (corners.roll(-1, dims=-2) - corners)[..., None, :] * share
-        moved = self._moved(edges.flatten(1, -2), params).to(corners.dtype).view(*edges.shape[:2], -1, 2)
+        moved = self._moved(edges.flatten(1, -2), params, inverse=inverse)
+        moved = moved.to(corners.dtype).view(*edges.shape[:2], -1, 2)
         (left, top), (right, bottom) = moved.amin(-2).unbind(-1), moved.amax(-2).unbind(-1)
         output = input.clone()
         output._data = torch.stack(
@@ -137,13 +172,15 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         )
         return camera.to(device).expand(len(coefficients), 3, 3), coefficients
 
-    def _moved(self, points: Tensor, params: dict[str, Tensor]) -> Tensor:
-        """Points (B, ..., 2) in pixels to where the lens images them."""
+    def _moved(self, points: Tensor, params: dict[str, Tensor], *, inverse: bool) -> Tensor:
+        """Points (B, ..., 2) in pixels to where the lens images them, or from there."""
         if points.numel() == 0:
             return points
         height, width = params["forward_input_shape"][-2:].tolist()
         camera, coefficients = self._lens(params, (height, width), points.device)
         flat = points.double().flatten(1, -2)
+        if inverse:
+            return undistort_points(flat, camera, coefficients, num_iters=_ITERATIONS).view(points.shape)
         return distort_points(flat, camera, coefficients).view(points.shape)
 
     def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:

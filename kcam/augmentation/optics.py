@@ -52,11 +52,11 @@ class RandomBlur(CameraAugmentation):
 
     def psf_shape(self, picture: tuple[int, int], wavelengths: Tensor) -> tuple[int, int]:
         """Window of the PSFs [pixels], for the worst that the ranges hold, so that it does not depend on the batch."""
-        return self.window(self.widest(wavelengths), picture)
+        return self.window(picture, self.widest(wavelengths))
 
-    def window(self, half_width: float, picture: tuple[int, int]) -> tuple[int, int]:
-        """Window for PSFs of a half width [m], at most the picture's size [pixels]."""
-        half = math.ceil(half_width / self.pixel_pitch)
+    def window(self, picture: tuple[int, int], width: float) -> tuple[int, int]:
+        """Pixels for PSFs of this half width [m]: odd, no more than the picture."""
+        half = math.ceil(width / self.pixel_pitch)
         height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
         return height, width
 
@@ -79,10 +79,14 @@ class RandomBlur(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """One depth: each channel of each sample with its PSF."""
+        return convolve(signal, self.kernels(signal, drawn)[:, 0])
+
+    @torch.compiler.disable  # its sizes follow from numbers, at each of which a graph would break
+    def kernels(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """The PSFs for a signal, (B, Z, L, h, w)."""
         wavelengths = wavelengths_of(signal, self.wavelengths)
         shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
-        psfs = self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
-        return convolve(signal, psfs[:, 0])
+        return self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
 
 
 def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
@@ -155,14 +159,18 @@ class RandomDefocus(RandomBlur):
         self.flags |= {"layers": layers}
 
     def widest(self, wavelengths: Tensor) -> float:
-        """Over the range of distances."""
-        return self.widest_between([1 / bound for bound in self.bounds("distance")], wavelengths)
+        """At the worst of the range of distances."""
+        low, high = self.bounds("distance")
+        return self.reach(1 / high, 1 / low, wavelengths=wavelengths)
 
-    def widest_between(self, ends: list[float], wavelengths: Tensor) -> float:
-        """The blur of the widest aperture, or the diffraction of the narrowest, between two vergences [1/m]."""
+    def reach(self, low: float, high: float, *, wavelengths: Tensor) -> float:
+        """Half width of the largest PSF of objects at these vergences [1/m] and between, in the ranges of the lens [m].
+
+        It is the blur of the widest aperture, or the diffraction of the narrowest.
+        """
         shortest, longest = self.bounds("focal_length")
         near, far = (1 / bound for bound in self.bounds("focus"))
-        most = max(abs(end - focus) for end in ends for focus in (near, far))
+        most = max(abs(end - focus) for end in (low, high) for focus in (near, far))
         sensor_distance = 1 / (1 / longest - near)
         widths = []
         for number in self.bounds("f_number"):
@@ -189,27 +197,33 @@ class RandomDefocus(RandomBlur):
         if "inverse_depth" not in drawn:
             return super().simulate(signal, drawn)
         depth = check_inverse_depth(drawn["inverse_depth"], signal).double()
-        wavelengths = wavelengths_of(signal, self.wavelengths)
-        low, high = depth.amin((1, 2, 3)), depth.amax((1, 2, 3))
-        share = torch.linspace(0, 1, self.layers, dtype=torch.float64, device=depth.device)
-        if self.layers == 1:
-            share = share + 0.5
-        vergences = low[:, None] + (high - low)[:, None] * share
-        picture, rows = (signal.shape[-2], signal.shape[-1]), []
+        rows = []
         for index in range(len(signal)):
-            # a map need not keep to the range of distances: a window for its own ends
-            ends = vergences[index].detach().tolist()
-            shape = self.window(self.widest_between(ends, wavelengths), picture)
-            own = {name: value[index : index + 1] for name, value in (drawn | {"vergences": vergences}).items()}
-            psfs = self.psfs(own, wavelengths=wavelengths, shape=shape, like=signal)
-            shares = None
-            if self.layers > 1 and high[index] > low[index]:
-                shares = layer_shares(depth[index : index + 1], vergences[index]).to(signal)
-            layers = Layers(signal[index : index + 1], shares)
-            renderer = Renderer(psfs[0], spectra=None, weights=None, picture=picture)
+            row = slice(index, index + 1)
+            own = {name: value[row] for name, value in drawn.items()} | {"inverse_depth": depth[row]}
+            vergences, psfs = self.layered(signal[row], own)
+            low, high = vergences[0], vergences[-1]
+            shares = None if len(vergences) == 1 or low == high else layer_shares(depth[row], vergences).to(signal)
+            layers = Layers(signal[row], shares)
+            renderer = Renderer(psfs, spectra=None, weights=None, picture=(signal.shape[-2], signal.shape[-1]))
             layers.add(renderer, first=0)
             rows.append(layers.light)
         return torch.cat(rows)
+
+    @torch.compiler.disable
+    def layered(self, signal: Tensor, drawn: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """For one sample and its map: vergences of the layers (Z,) [1/m], and their PSFs (Z, L, h, w).
+
+        The window is that of this map, which may reach beyond the range of distances.
+        """
+        low, high = drawn["inverse_depth"].aminmax()
+        share = torch.linspace(0, 1, self.layers, dtype=low.dtype, device=low.device)
+        vergences = low + (high - low) * (share if self.layers > 1 else share + 0.5)
+        wavelengths = wavelengths_of(signal, self.wavelengths)
+        width = self.reach(float(low.detach()), float(high.detach()), wavelengths=wavelengths)
+        shape = self.window((signal.shape[-2], signal.shape[-1]), width)
+        drawn = drawn | {"vergences": vergences[None]}
+        return vergences, self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)[0]
 
 
 def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:

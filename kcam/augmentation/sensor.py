@@ -32,7 +32,7 @@ class RandomBayer(CameraAugmentation):
                method: a name in `isp.DEMOSAICS`; None for the default of the pattern.
                colour_filter: for cubes; None for `ColourFilter.kodak()`, or `rgbw()` for the pattern of that name.
                wavelengths: of a cube's bands [m].
-    Raises:    ValueError for an unknown pattern or method; at the call, for a cube with p < 1.
+    Raises:    ValueError for an unknown pattern or method, or none; at the call, for a cube with p < 1.
     """
 
     def __init__(
@@ -47,6 +47,8 @@ class RandomBayer(CameraAugmentation):
         keepdim: bool = False,
     ) -> None:
         names = BAYER if pattern == "random" else (pattern,) if isinstance(pattern, str) else tuple(pattern)
+        if not names:
+            raise ValueError(f'pattern is empty: give "random", or at least one of {", ".join(BAYER)}.')
         for name in names:
             Demosaic(method, pattern=name)  # refuses what does not exist
         super().__init__({"pattern": Choice(len(names))}, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
