@@ -195,6 +195,7 @@ def _rounded(count: float) -> int:
 
 
 @functools.lru_cache(maxsize=12)
+@torch.inference_mode(False)  # what is kept must serve training too
 def _hankel_table(nodes: int, arguments: int) -> tuple[Tensor, Tensor, Tensor]:
     """Gauss-Legendre rho and weights (n,) on 0..1, and J0(t rho) (n, T) at t = 0, _STEP, ..."""
     if nodes * arguments > _LARGEST_TABLE:
@@ -220,6 +221,7 @@ def _cubic(offset):
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
 def _ring_shares(half: int, per_pixel: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Integral over each pixel (far, near), 0 <= near <= far <= half, of a radial function, cubic between steps.
 
