@@ -1,6 +1,6 @@
 """Every camera augmentation on one picture, at three strengths.
 
-    python examples/augmentation_gallery.py [--out augmentations.png]
+python examples/augmentation_gallery.py [--out augmentations.png]
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import kornia.augmentation as K
 import torch
 from skimage import data
 from torch import Tensor
@@ -21,6 +22,28 @@ from kcam.units import mm, um
 SIDE = 180
 PHONE: dict[str, Any] = {"focal_length": 4.3 * mm, "pixel_pitch": 1.4 * um, "p": 1.0}
 FULL_FRAME: dict[str, Any] = {"focal_length": 50 * mm, "pixel_pitch": 6 * um, "p": 1.0}
+
+
+def through_depth(focus: float) -> Callable[[Tensor], Tensor]:
+    """A picture whose left side is near."""
+    stage = KC.RandomDefocus(focus=focus, f_number=2.8, **FULL_FRAME)
+
+    def photograph(picture: Tensor) -> Tensor:
+        vergence = torch.linspace(1 / 1.8, 1 / 2.5, picture.shape[-1]).expand(1, 1, *picture.shape[-2:])
+        return stage(picture, inverse_depth=vergence)
+
+    return photograph
+
+
+def drawn_pipeline(seed: int) -> Callable[[Tensor], Tensor]:
+    """Lens, sensor and processor as they draw by default, each for every picture."""
+    torch.manual_seed(seed)
+    lens = [KC.RandomLensDistortion(p=1.0), KC.RandomChromaticAberration(p=1.0), KC.RandomVignetting(p=1.0)]
+    sensor = [KC.RandomBayer(), KC.RandomShotReadNoise(p=1.0), KC.RandomQuantisation(p=1.0)]
+    processor = [KC.RandomWhiteBalance(p=1.0), KC.RandomColourMatrix(p=1.0), KC.RandomToneCurve(p=1.0)]
+    return K.ImageSequential(*lens, *sensor, *processor)
+
+
 Strengths = dict[str, Callable[[], Any]]
 GALLERY: dict[str, tuple[str, Strengths]] = {
     "RandomDefocus": (
@@ -30,13 +53,17 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
             for at in (1.95, 1.9, 1.8)
         },
     ),
+    "RandomDefocus, a depth map": (
+        "1.8 m (left) to 2.5 m; 50 mm f/2.8, focus",
+        {f"{focus:g} m": lambda focus=focus: through_depth(focus) for focus in (1.8, 2.1, 2.5)},
+    ),
     "RandomDiffraction": (
         "phone, 1.4 um pixels, at",
         {f"f/{n:g}": lambda n=n: KC.RandomDiffraction(f_number=n, **PHONE) for n in (4.0, 8.0, 16.0)},
     ),
     "RandomAberration": (
-        "8 mm f/2.8, Zernikes of RMS",
-        {f"{r:g} waves": lambda r=r: KC.RandomAberration(rms=r, f_number=2.8, p=1.0) for r in (0.2, 0.5, 1.0)},
+        "8 mm f/2.8, Zernikes, waves RMS",
+        {f"{r:g}": lambda r=r: KC.RandomAberration(rms=r, f_number=2.8, p=1.0) for r in (0.2, 0.5, 1.0)},
     ),
     "RandomChromaticAberration": (
         "half a singlet's axial, and lateral of",
@@ -62,7 +89,7 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
         },
     ),
     "RandomShotReadNoise": (
-        "10 000 electrons at base ISO;",
+        "full well of 10 000 electrons",
         {f"ISO {i}": lambda i=i: KC.RandomShotReadNoise(iso=float(i), p=1.0) for i in (800, 3200, 12800)},
     ),
     "RandomFixedPattern": (
@@ -70,8 +97,8 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
         {f"{v:.0%}": lambda v=v: KC.RandomFixedPattern(prnu=v, dsnu=20.0, p=1.0) for v in (0.03, 0.08, 0.15)},
     ),
     "RandomExposure": (
-        "saturates at the full well",
-        {f"{s:+g} stops": lambda s=s: KC.RandomExposure(stops=s, p=1.0) for s in (-2.0, 1.0, 2.0)},
+        "stops; saturates at the full well",
+        {f"{s:+g}": lambda s=s: KC.RandomExposure(stops=s, p=1.0) for s in (-2.0, 1.0, 2.0)},
     ),
     "RandomQuantisation": (
         "an ADC in linear light",
@@ -85,7 +112,7 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
         },
     ),
     "RandomColourMatrix": (
-        "elements off by",
+        "its elements off by (RMS)",
         {f"{s:g}": lambda s=s: KC.RandomColourMatrix(strength=s, p=1.0) for s in (0.05, 0.15, 0.3)},
     ),
     "RandomToneCurve": (
@@ -98,6 +125,10 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
     "RandomCamera": (
         "a phone focused at 2 m; the picture at",
         {f"{d:g} m": lambda d=d: KC.RandomCamera(["phone"], distance=d) for d in (2.0, 1.0, 0.6)},
+    ),
+    "All in a row": (
+        "as a pipeline draws them",
+        {f"draw {seed}": lambda seed=seed: drawn_pipeline(seed) for seed in (1, 2, 3)},
     ),
 }
 """Augmentation -> what is shown of it, and its three strengths."""
@@ -120,7 +151,8 @@ def gallery(side: int = SIDE) -> dict[str, list[Tensor]]:
             rows = []
             for build in strengths.values():
                 torch.set_rng_state(state)  # what is drawn is the same, so that only the strength differs
-                rows.append(build()(picture)[0])
+                stage = build()
+                rows.append(stage(picture)[0])
             found[name] = rows
     return found
 
