@@ -112,7 +112,7 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         rows = gate.nonzero().flatten()
         if rows.numel() == 0:
             return input
-        result = function(input[rows.to(input.device)], {name: value[rows] for name, value in drawn.items()})
+        result = function(input.index_select(0, rows.to(input.device)), {name: value[rows] for name, value in drawn.items()})
         if result.shape[1:] != input.shape[1:]:
             raise ValueError(
                 f"{type(self).__name__} turns {input.shape[1]} channels into {result.shape[1]}, which only some rows "
