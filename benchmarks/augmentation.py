@@ -341,7 +341,9 @@ def compare(name: str, case: Case, *, channels: int, batch: int, side: int, seco
         coded = getattr(own, "in_light", False) and is_picture(picture)
         light = (to_light(picture) if coded else picture)[rows]
         if p == 1:
-            contestants.append(straightforward(case, own, light, drawn, coded=coded, truth=own(picture, params=params)))
+            contestants.append(
+                straightforward(case, own, picture, drawn, coded=coded, truth=own(picture, params=params))
+            )
             if channels in case.relative_only:
                 contestants += [Contestant(who, seeded(make(p)), no_error) for who, make in case.relatives.items()]
             if coded:
@@ -374,19 +376,20 @@ def compare(name: str, case: Case, *, channels: int, batch: int, side: int, seco
 
 
 def straightforward(
-    case: Case, own: Any, light: Tensor, drawn: dict[str, Tensor], *, coded: bool, truth: Tensor
+    case: Case, own: Any, picture: Tensor, drawn: dict[str, Tensor], *, coded: bool, truth: Tensor
 ) -> Contestant:
     """The plain way on the rows that it is run on, with its largest difference from our result."""
-    few = max(1, round(case.share * len(light)))
+    few = max(1, round(case.share * len(picture)))
 
     def call() -> Tensor:
-        result = case.plain(own, light[:few], {key: value[:few] for key, value in drawn.items()})
+        light = to_light(picture[:few]) if coded else picture[:few]
+        result = case.plain(own, light, {key: value[:few] for key, value in drawn.items()})
         return tone_curve(result) if coded else result
 
     def difference(result: Tensor) -> dict[str, float]:
         return {"largest difference": float((result - truth).abs().max())} if case.exact else {}
 
-    return Contestant("straightforward", call, difference, share=few / len(light))
+    return Contestant("straightforward", call, difference, share=few / len(picture))
 
 
 def no_error(result: Tensor) -> dict[str, float]:
