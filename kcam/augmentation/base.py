@@ -113,13 +113,14 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         rows = gate.nonzero().flatten()
         if rows.numel() == 0:
             return input
-        result = function(input[rows.to(input.device)], {name: value[rows] for name, value in drawn.items()})
+        here = rows.to(input.device)
+        result = function(input.index_select(0, here), {name: value[rows] for name, value in drawn.items()})
         if result.shape[1:] != input.shape[1:]:
             raise ValueError(
                 f"{type(self).__name__} turns {input.shape[1]} channels into {result.shape[1]}, which only some rows "
                 f"of a batch cannot have. Use p=1.0, not p={self.p:g}."
             )
-        return input.index_copy(0, rows.to(input.device), result)
+        return input.index_copy(0, here, result)
 
     def _drawn(self, params: dict[str, Any]) -> dict[str, Tensor]:
         """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""

@@ -93,7 +93,15 @@ def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
     """Each channel of each picture (B,C,H,W) with its own PSF (B,C,h,w), upright; beyond the border it is reflected."""
     picture, window = (signal.shape[-2], signal.shape[-1]), (psfs.shape[-2], psfs.shape[-1])
     sizes = Convolution.of(picture, window, border="reflect", itemsize=signal.element_size(), max_memory=2e9)
-    return sizes.back(sizes.transform(signal) * sizes.transfer(psfs))
+    planes, kernels = signal.flatten(0, 1)[:, None], psfs.flatten(0, 1)[:, None]
+    # few planes at once stay in a CPU's cache: three times as fast on 28 bands; a GPU wants many
+    split = signal.device.type == "cpu" and not torch.compiler.is_compiling()
+    at_once = sizes.bands if split else len(planes)
+    parts = [
+        sizes.back(sizes.transform(some) * sizes.transfer(their))
+        for some, their in zip(planes.split(at_once), kernels.split(at_once), strict=True)
+    ]
+    return torch.cat(parts).view(signal.shape)
 
 
 class RandomDefocus(RandomBlur):

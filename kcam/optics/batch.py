@@ -75,57 +75,72 @@ def batch_psf(
     if coefficients is None:
         return _radial_bank(residual, a=a, d=d, grid=grid, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
 
-    def zernikes(x: Tensor, y: Tensor) -> list[Tensor]:
-        pupil = Pupil(x, y, torch.ones_like(a[0]), torch.ones_like(a[0]), paraxial=True)
-        count = 0 if coefficients is None else coefficients.shape[1]
-        unit = torch.eye(count, dtype=torch.float64, device=device)
-        return [pupil.rho2, *(zernike_sum(unit[j], pupil) for j in range(count))]
-
+    terms = coefficients.shape[1]
     # OPD as coefficients of rho^2 and of the Zernikes, (B, 1 or L, Z, T)
     opd = (residual.transpose(1, 2) * a[:, None, None] ** 2 / 2)[..., None]
-    if coefficients is not None:
-        own = coefficients.to(device, torch.float64)[:, None, None].expand(-1, opd.shape[1], layers, -1)
-        opd = torch.cat([opd, own], dim=-1)
+    own = coefficients.to(device, torch.float64)[:, None, None].expand(-1, opd.shape[1], layers, -1)
+    opd = torch.cat([opd, own], dim=-1)
     with torch.no_grad():
-        side = torch.linspace(-1, 1, 65, dtype=torch.float64, device=device)
-        coarse = torch.stack(zernikes(side[None, :], side[:, None]))
-        inside = (side[None, :] ** 2 + side[:, None] ** 2 <= 1.0001).flatten()
+        side = torch.linspace(-1, 1, 65, dtype=torch.float64)
+        coarse = _zernike_maps(side, terms).to(device)
+        inside = (side[None, :] ** 2 + side[:, None] ** 2 <= 1.0001).flatten().to(device)
         slopes = [
             (opd @ g.flatten(1)[:, inside]).square() for g in torch.gradient(coarse, spacing=2 / 64, dim=(-2, -1))
         ]
         displacement = torch.stack(slopes).sum(0).sqrt().amax(dim=(1, 2, 3)) * d / a
-        widest = a / d
-        half_window = (max(shape) // 2 + sampling.WINDOW_MARGIN) * pixel_pitch
-        shortest = float(grid.min())
-        count = max(
-            sampling.pupil_samples(
-                semi_aperture=float(a_b),
-                sensor_distance=float(d_b),
-                wavelength=shortest,
-                half_window=half_window,
-                displacement=float(s_b),
-            )
-            for a_b, d_b, s_b in zip(a, d, displacement, strict=True)
+    # lens by lens: a slow lens needs a smaller pupil and fewer points than the fastest of the batch
+    images = [
+        _aberrated(
+            opd[b], a=a[b], d=d[b], displacement=float(displacement[b]), grid=grid, pixel_pitch=pixel_pitch,
+            shape=shape, dtype=dtype,
         )
-        if count > sampling.MAX_PUPIL_SAMPLES:
-            raise ValueError(
-                f"this batch needs {count} pupil samples, more than {sampling.MAX_PUPIL_SAMPLES}: the largest blur "
-                f"reaches {float(displacement.max()) * 1e3:.3g} mm. Use smaller radii, vergences or shape."
-            )
-        per_pixel = sampling.points_per_pixel(
-            pixel_pitch=pixel_pitch, semi_aperture=float(widest.max()), sensor_distance=1.0, wavelength=shortest
+        for b in range(batch)
+    ]  # fmt: skip
+    return torch.stack(images)
+
+
+def _aberrated(
+    opd: Tensor,
+    *,
+    a: Tensor,
+    d: Tensor,
+    displacement: float,
+    grid: Tensor,
+    pixel_pitch: float,
+    shape: tuple[int, int],
+    dtype: torch.dtype,
+) -> Tensor:
+    """PSFs (Z, L, H, W) of one lens by matrix products; opd (1 or L, Z, T), displacement: of its rays [m]."""
+    device = opd.device
+    shortest = float(grid.min())
+    margin = max(shape) // 2 + sampling.WINDOW_MARGIN
+    count = sampling.pupil_samples(
+        semi_aperture=float(a.detach()),
+        sensor_distance=float(d.detach()),
+        wavelength=shortest,
+        half_window=margin * pixel_pitch,
+        displacement=displacement,
+    )
+    if count > sampling.MAX_PUPIL_SAMPLES:
+        raise ValueError(
+            f"this batch needs {count} pupil samples, more than {sampling.MAX_PUPIL_SAMPLES}: the largest blur "
+            f"reaches {displacement * 1e3:.3g} mm. Use smaller radii, vergences or shape."
         )
-    reach = math.ceil(per_pixel * (max(shape) // 2 + sampling.WINDOW_MARGIN))
-    step = pixel_pitch / per_pixel
+    per_pixel = sampling.points_per_pixel(
+        pixel_pitch=pixel_pitch,
+        semi_aperture=float(a.detach()),
+        sensor_distance=float(d.detach()),
+        wavelength=shortest,
+    )
+    reach, step = math.ceil(per_pixel * margin), pixel_pitch / per_pixel
     nodes = grid_nodes(count)
-    maps = torch.stack([m.expand(count, count) for m in zernikes(nodes[None, :].to(device), nodes[:, None].to(device))])
+    like = torch.empty(0, dtype=dtype, device=device)
     wavenumbers = (2 * math.pi / grid).to(device)
     weights = unfold_quadrant(disc_weights(count, spacing=grid_spacing(count))).to(device)
-    scales = (wavenumbers * (a / d)[:, None]).flatten()  # (B L,)
-    like = torch.empty(0, dtype=dtype, device=device)
+    scales = wavenumbers * (a / d)
     intensity = pupil_intensity(
-        (wavenumbers[:, None, None] * opd).flatten(0, 1).to(dtype),
-        maps=maps.to(dtype),
+        (wavenumbers[:, None, None] * opd).to(dtype),
+        maps=_pupil_maps(count, opd.shape[-1] - 1, dtype).to(device),
         amplitude=weights[None].to(dtype),
         field=None,
         scales=scales.to(dtype),
@@ -136,10 +151,24 @@ def batch_psf(
         step=step,
     )
     area = grid_spacing(count) ** 2 / float(weights.sum())
-    factor = area * (a[:, None] * pixel_pitch / (grid.to(device) * d[:, None])) ** 2  # (B, L)
+    factor = area * (a * pixel_pitch / (grid.to(device) * d)) ** 2  # (L,)
     rows, columns = (sampling.pixel_box(n, per_pixel=per_pixel, reach=reach).to(like) for n in shape)
-    images = (rows @ intensity @ columns.mT).unflatten(0, (batch, -1)) * factor[..., None, None, None].to(dtype)
-    return images.transpose(1, 2)
+    return ((rows @ intensity @ columns.mT) * factor[:, None, None, None].to(dtype)).transpose(0, 1)
+
+
+def _zernike_maps(nodes: Tensor, terms: int) -> Tensor:
+    """rho^2 and Noll's j = 1..terms on a grid of normalised nodes, (1 + terms, N, N)."""
+    one = torch.ones((), dtype=torch.float64)
+    pupil = Pupil(nodes[None, :], nodes[:, None], one, one, paraxial=True)
+    unit = torch.eye(terms, dtype=torch.float64)
+    maps = [pupil.rho2, *(zernike_sum(unit[j], pupil) for j in range(terms))]
+    return torch.stack([m.expand(len(nodes), len(nodes)) for m in maps])
+
+
+@functools.lru_cache(maxsize=8)  # 13 MB for 15 terms on 448 nodes
+@torch.inference_mode(False)
+def _pupil_maps(count: int, terms: int, dtype: torch.dtype) -> Tensor:
+    return _zernike_maps(grid_nodes(count), terms).to(dtype)
 
 
 def _radial_bank(
@@ -258,6 +287,7 @@ class _Fresnel(torch.autograd.Function):
 
 
 @functools.lru_cache(maxsize=12)
+@torch.inference_mode(False)  # what is kept must serve training too
 def _bessel_table(nodes: int, arguments: int, device: torch.device) -> Tensor:
     """J0(t rho), (n, T)."""
     rho = torch.as_tensor(legendre(nodes)[0], device=device) / 2 + 0.5
@@ -276,6 +306,7 @@ def _cubic(offset):
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
 def _ring_shares(half: int, per_pixel: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Integral over each pixel (far, near), 0 <= near <= far <= half, of a radial function, cubic between steps.
 

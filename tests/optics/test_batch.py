@@ -180,3 +180,27 @@ def test_bad_input(change: dict, message: str) -> None:
     given |= {"sensor_distance": SENSOR, "pixel_pitch": 4 * um, "shape": (301, 301)} | change
     with pytest.raises(ValueError, match=message):
         optics.batch_psf(given.pop("vergences"), **given)
+
+
+@pytest.mark.parametrize("aberrated", [False, True])
+def test_a_first_call_in_inference_mode_does_not_spoil_training(aberrated: bool) -> None:
+    """Tables that are kept would be inference tensors, which autograd refuses."""
+
+    def bank(radii: torch.Tensor) -> torch.Tensor:
+        return optics.batch_psf(
+            torch.tensor([0.37]),
+            radii=radii,
+            coefficients=torch.full((1, 5), 20e-9) if aberrated else None,
+            wavelengths=WAVELENGTHS,
+            sensor_distance=SENSOR,
+            pixel_pitch=3.7 * um,  # no other test's tables
+            shape=(23, 23),
+            dtype=torch.float64,
+        )
+
+    radii = torch.tensor([1.37 * mm], dtype=torch.float64, requires_grad=True)
+    with torch.inference_mode():
+        bank(radii)
+    gradient = torch.autograd.grad(bank(radii).amax(), radii)[0]
+    assert bool(gradient.isfinite().all())
+    assert float(gradient.abs()) > 0
