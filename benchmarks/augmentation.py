@@ -245,7 +245,7 @@ class Case:
 
 
 def blur(p: float) -> nn.Module:
-    """As wide as what RandomDefocus draws, by RMS: sigma up to a quarter of the widest blur of 36 pixels."""
+    """In the window that RandomDefocus takes for its PSFs on pictures, 57 x 57; its time does not depend on sigma."""
     return K.RandomGaussianBlur((57, 57), (1.0, 9.0), p=p)
 
 
