@@ -22,6 +22,7 @@ from kcam.ste import clip_ste
 from kcam.units import wavelength_grid
 
 _NEAREST_VERGENCE = 1e-9  # 1/m: a map's 0 is infinity
+_PLANS = 64  # kept
 _SCENE = "coffee"  # what is planned for: detail of all sizes, saturated colours
 
 
@@ -112,6 +113,8 @@ class RandomCamera(CameraAugmentation):
             plan = camera.plan(scenes, tolerance=self.tolerance)
             # a plain camera: a PlannedCamera would warn of each picture that is not like the fixed scene
             self._planned[key] = Camera(*plan.apply(camera), context=camera.resolve())
+        if len(self._planned) > _PLANS:  # of pictures of ever other sizes, the oldest goes
+            del self._planned[next(iter(self._planned))]
         return self._planned[key]
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:

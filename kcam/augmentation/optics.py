@@ -349,7 +349,7 @@ class RandomAberration(FocusedBlur):
 
     W = sum_j c_j Z_j,   sum_j c_j^2 = (rms 550 nm)^2,   in a direction that is uniform on the sphere
 
-    Args:      rms: of the wavefront [waves at 550 nm]; 0.07 is the limit of what counts as diffraction limited.
+    Args:      rms: of the wavefront [waves at 550 nm], up to 5; 0.07 is what counts as diffraction limited.
                f_number, focal_length, pixel_pitch: of the lens. Others: as for `RandomBlur`.
     Source:    Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
@@ -370,7 +370,7 @@ class RandomAberration(FocusedBlur):
         keepdim: bool = False,
     ) -> None:
         super().__init__(
-            {"rms": Uniform(rms, least=0.0, most=50.0, unit="[waves]"), "direction": Normal(self.TERMS)},
+            {"rms": Uniform(rms, least=0.0, most=5.0, unit="[waves]"), "direction": Normal(self.TERMS)},
             f_number=f_number,
             focal_length=focal_length,
             pixel_pitch=pixel_pitch,
