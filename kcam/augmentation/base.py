@@ -8,6 +8,7 @@ Y = 1, as in `Scene.from_bands`: about 1 in each band, not 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -23,6 +24,10 @@ from kcam.units import nm, wavelength_grid
 
 RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
 """Dominant wavelengths of the primaries of sRGB, seen against its white (from CIE 1931 chromaticities)."""
+
+
+_LARGEST = 2.5
+"""Of a picture: some above 1 come from other augmentations, and are white; from here on it is another scale."""
 
 
 def is_picture(signal: Tensor) -> bool:
@@ -65,6 +70,28 @@ def per_sample(values: Tensor, signal: Tensor) -> Tensor:
     return values.to(signal)[:, None, None, None]
 
 
+def check_probability(p: float) -> None:
+    """ValueError, TypeError unless p is a probability."""
+    if isinstance(p, bool) or not isinstance(p, (int, float)):
+        raise TypeError(f"p must be a probability such as 0.5, got {p!r}.")
+    if not 0 <= p <= 1:
+        raise ValueError(f"p must be a probability from 0 to 1, got {p:g}.")
+
+
+def check_values(signal: Tensor) -> None:
+    """ValueError for NaN or infinity, which a blur would spread over all, and for a picture of 0..255."""
+    if torch.compiler.is_compiling():
+        return
+    low, high = (float(value) for value in signal.detach().aminmax())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"the input has values from {low:g} to {high:g}, expected finite ones. Remove NaN and inf.")
+    if is_picture(signal) and high > _LARGEST:
+        raise ValueError(
+            f"the picture has values up to {high:g}, expected sRGB in [0,1]. Use image / "
+            f"{255 if high < 256 else 65535}."
+        )
+
+
 class CameraAugmentation(K.IntensityAugmentationBase2D):
     """Base of the augmentations that keep the pixel grid. A subclass computes in `simulate`.
 
@@ -74,10 +101,13 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
 
     in_light = True
     """Whether `simulate` wants pictures in linear light."""
+    takes_depth = False
+    """Whether a map of inverse depth matters to it."""
 
     def __init__(
         self, draws: Mapping[str, Draw], *, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False
     ) -> None:
+        check_probability(p)
         super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
         self._param_generator: Draws = Draws(draws)
 
@@ -129,10 +159,17 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
             rows = drawn["noise_seed"].shape[0]
             frames = rows // max(1, int(params["video_batch_size"]))
             drawn["noise_seed"] = drawn["noise_seed"] + torch.arange(rows) % max(1, frames)
-        return drawn | {name: params[name] for name in ("inverse_depth",) if name in params}
+        if "depth" in params:
+            raise TypeError("depth= is not known: give inverse_depth=1 / depth, in 1/m, 0 at infinity.")
+        if "inverse_depth" in params:
+            if not self.takes_depth:
+                raise TypeError(f"{type(self).__name__} takes no inverse_depth: what it does is the same everywhere.")
+            drawn["inverse_depth"] = params["inverse_depth"]
+        return drawn
 
     def _simulated(self, input: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         working = input if input.dtype in (torch.float32, torch.float64) else input.float()
+        check_values(working)
         with full_precision(input.device):
             coded = self.in_light and is_picture(working)
             result = self.simulate(to_light(working) if coded else working, drawn)

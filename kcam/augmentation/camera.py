@@ -37,13 +37,15 @@ class RandomCamera(CameraAugmentation):
     for a batch: the result for a sample does not depend on the others. With a map it is planned from infinity to the
     near end of that range, or for a nearer map, to the next power of 2 [1/m] beyond its nearest point.
 
+    A PSF is no wider than the picture, as in any camera here: small pictures of things far out of focus get darker.
+
     Args:      cameras: presets by name, files that `Camera.save` wrote, or cameras. Presets and files are not trained;
                    a camera of one's own keeps its parameters, and gradients reach them.
                tolerance: of the plan, see `kcam.planner.make_plan`; 0 for the reference physics.
                distance: of the picture [m], uniform in 1/m.
                wavelengths: of a cube's bands [m].
-    Raises:    ValueError for no cameras, an unknown preset, cameras that do not end in three channels, a bad tolerance;
-        at the call, where the channels change, for p < 1.
+    Raises:    ValueError for no cameras, an unknown preset, a bad tolerance; at the call, for cameras that do not end
+        in three channels, and for p < 1 where the channels change.
     """
 
     in_light = False
@@ -151,6 +153,8 @@ class RandomCamera(CameraAugmentation):
 def _opened(camera: str | os.PathLike[str] | Camera) -> Camera:
     if isinstance(camera, Camera):
         return camera
+    if not isinstance(camera, (str, os.PathLike)):
+        raise TypeError(f"cameras must be names, files or cameras, got {camera!r}.")
     if str(camera) in PRESETS:
         return Camera.preset(str(camera)).requires_grad_(False)
     if Path(camera).suffix:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -75,19 +76,27 @@ CORRUPTIONS: dict[str, Corruption] = {
 
 
 def corrupt(image: Any, corruption: str, *, severity: int = 1, seed: int = 0) -> Any:
-    """A picture as a bad camera gives it, the same at every call.
+    """A picture as a bad camera gives it, the same at every call; the i-th of a batch is drawn from seed + i.
 
     Args:      image: (B,3,H,W), (3,H,W), or a NumPy array or PIL image as Kornia's containers take them; sRGB in [0,1].
                corruption: a name in `CORRUPTIONS`. severity: 1 to 5. seed: of what is random in it, such as noise; the
                global generator is left as it is.
     Returns:   a tensor of the shape, type and device of the picture, in [0,1].
-    Raises:    ValueError for an unknown name or severity.
+    Raises:    ValueError for an unknown name or severity; TypeError for a path, or a seed that is no integer.
     """
+    if isinstance(image, (str, bytes, os.PathLike)):
+        raise TypeError(f"image must be a tensor, an array or a PIL image, got {image!r}. Read the file first.")
+    if isinstance(seed, bool) or not isinstance(seed, int):
+        raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
     if corruption not in CORRUPTIONS:
         raise ValueError(f"unknown corruption {corruption!r}. There are: {', '.join(CORRUPTIONS)}.")
     if isinstance(severity, bool) or severity not in (1, 2, 3, 4, 5):
         raise ValueError(f"severity must be 1, 2, 3, 4 or 5, got {severity!r}.")
     pipeline = K.ImageSequential(CORRUPTIONS[corruption].build(int(severity)), keepdim=True)
+    pictures = image.split(1) if isinstance(image, torch.Tensor) and image.ndim == 4 and len(image) > 1 else [image]
+    found = []
     with torch.random.fork_rng(devices=[]):  # all is drawn on the CPU; a worker must not wake a GPU
-        torch.default_generator.manual_seed(seed)
-        return pipeline(image)
+        for index, picture in enumerate(pictures):
+            torch.default_generator.manual_seed(seed + index)
+            found.append(pipeline(picture))
+    return found[0] if len(found) == 1 else torch.cat(found)

@@ -43,18 +43,21 @@ class Uniform:
         low, high = found[0], found[-1]
         if not self.allows(self.bounds if isinstance(self.bounds, Tensor) else values):
             raise ValueError(
-                f"{name} must be {expected} with {self.least:g} <= low <= high <= {self.most:g}, "
-                f"got ({low:g}, {high:g})."
+                f"{name} must be {expected} with {self.least:g} <= low <= high <= {self.most:g}"
+                f"{'' if self.scale == 'vergence' else ', finite'}, got ({low:g}, {high:g})."
             )
         if isinstance(self.bounds, nn.Parameter):
             if values.shape != (2,):
                 raise ValueError(f"{name} as a parameter must be (2,), its two bounds, got {tuple(values.shape)}.")
             return self.bounds
-        return torch.tensor([low, high], dtype=torch.float64)
+        # in the default type: Kornia's containers make pictures of a NumPy array in that of the first buffer
+        return torch.tensor([low, high])
 
     def allows(self, bounds: Tensor) -> bool:
         """Whether these bounds are within least and most, to their type's rounding: float32's 0.49 is above 0.49."""
         low, high = bounds.detach().double().flatten()[[0, -1]].tolist()
+        if self.scale != "vergence" and not (math.isfinite(low) and math.isfinite(high)):
+            return False
         slack = torch.finfo(bounds.dtype if bounds.is_floating_point() else torch.float64).eps
         return self.least - slack * abs(self.least) <= low <= high <= self.most + slack * abs(self.most)
 
@@ -140,7 +143,7 @@ class Draws(RandomGeneratorBase):
                     low, high = self.bounds(name)
                     raise ValueError(
                         f"{name} was trained or loaded to ({low:g}, {high:g}), outside {draw.least:g} <= low <= high "
-                        f"<= {draw.most:g}. Clamp it after each step."
+                        f"<= {draw.most:g}. Sort and clamp it after each step."
                     )
                 value = draw.between(bounds, torch.rand(count, dtype=torch.float64).to(bounds.device))
             elif isinstance(draw, Normal):

@@ -14,6 +14,7 @@ from kornia.geometry.keypoints import Keypoints
 from kornia.geometry.transform import remap
 from torch import Tensor
 
+from kcam.augmentation.base import check_probability
 from kcam.augmentation.draws import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
@@ -52,6 +53,9 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         p: float = 0.5,
         keepdim: bool = False,
     ) -> None:
+        check_probability(p)
+        if resample not in ("bilinear", "nearest"):
+            raise ValueError(f'resample must be "bilinear" or "nearest", got {resample!r}.')
         super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
         if not focal_length > 0:
             raise ValueError(f"focal_length must be > 0 of the picture's longer side, got {focal_length:g}.")

@@ -46,6 +46,8 @@ class RandomBayer(CameraAugmentation):
         p: float = 1.0,
         keepdim: bool = False,
     ) -> None:
+        if not isinstance(pattern, Sequence):
+            raise TypeError(f'pattern must be "random", a name such as "RGGB", or several, got {pattern!r}.')
         names = BAYER if pattern == "random" else (pattern,) if isinstance(pattern, str) else tuple(pattern)
         if not names:
             raise ValueError(f'pattern is empty: give "random", or at least one of {", ".join(BAYER)}.')
@@ -213,9 +215,10 @@ class RandomQuantisation(CameraAugmentation):
         p: float = 0.5,
         keepdim: bool = False,
     ) -> None:
-        low, high = (bits, bits) if isinstance(bits, int) else bits
-        if not (isinstance(low, int) and isinstance(high, int) and 1 <= low <= high <= 24):
+        ends = (bits, bits) if isinstance(bits, int) else tuple(bits) if isinstance(bits, Sequence) else ()
+        if len(ends) != 2 or not all(type(end) is int for end in ends) or not 1 <= ends[0] <= ends[1] <= 24:
             raise ValueError(f"bits must be whole numbers (fewest, most) within 1..24, got {bits!r}.")
+        low, high = ends
         super().__init__({"bits": Choice(high - low + 1)}, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
         self.flags = {"range": (low, high)}
         self.fewest = low

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -15,14 +17,17 @@ from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from torch import Tensor, nn
 
+from kcam.augmentation.base import wavelengths_of
 from kcam.augmentation.optics import check_inverse_depth
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context, Stage
 from kcam.optics import Imaging
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, Mosaic
+from kcam.units import wavelength_grid
 
 _LEAST_VERGENCE = 1e-9  # 1/m
+_NEAR = 100.0  # 1/m, a centimetre: nearer than pictures are taken from
 
 
 class CameraSequential(K.AugmentationSequential):
@@ -38,6 +43,8 @@ class CameraSequential(K.AugmentationSequential):
 
     Args:      depth: False where the first mask is no depth.
                depth_key: which mask it is instead: its place in data_keys, or its name in a dict call ("mask_depth").
+               wavelengths: of the channels that come in [m], for plain stages; None for the primaries of a picture of 3
+               channels, and for other numbers as many bands from 420 to 720 nm.
                Others: as for `K.AugmentationSequential`.
     Raises:    ValueError for stages that contradict each other or stand in an impossible order, geometry between a
         mosaic and its demosaic, random_apply with stages; at the call for a depth_key that is no mask, or a module that
@@ -50,6 +57,7 @@ class CameraSequential(K.AugmentationSequential):
         data_keys: Sequence[str] | Sequence[int] | Sequence[DataKey] | None = (DataKey.INPUT,),
         depth: bool = True,
         depth_key: int | str | None = None,
+        wavelengths: Tensor | list[float] | None = None,
         same_on_batch: bool | None = None,
         keepdim: bool | None = None,
         random_apply: int | bool | tuple[int, int] = False,
@@ -66,6 +74,8 @@ class CameraSequential(K.AugmentationSequential):
             extra_args=extra_args,
         )
         self.depth, self.depth_key = depth, depth_key
+        self.wavelengths = None if wavelengths is None else wavelength_grid(wavelengths)
+        self._bands: Tensor | None = None
         self.transform_op: _Ops = _Ops(self.data_keys, self)
         if random_apply and self._stages():
             raise ValueError("random_apply would shuffle camera stages, which light passes in order. Leave it out.")
@@ -76,8 +86,9 @@ class CameraSequential(K.AugmentationSequential):
         return [module for module in _flat(self.children()) if isinstance(module, Stage)]
 
     def context(self) -> Context:
-        """What the stages tell each other."""
-        return Camera(*self._stages()).resolve()
+        """What the stages tell each other, and the wavelengths of what came in."""
+        context = Camera(*self._stages()).resolve()
+        return context if self._bands is None else dataclasses.replace(context, wavelengths=self._bands)
 
     def output_channels(self, channels: int) -> int:
         """Channels of the result for so many of the input."""
@@ -109,6 +120,7 @@ class CameraSequential(K.AugmentationSequential):
     ) -> Tensor:
         """What another container calls: pictures alone."""
         self.clear_state()
+        self._enters(input)
         for param in params:
             module = self.get_submodule(param.name)
             if self.runs(module):
@@ -148,10 +160,27 @@ class CameraSequential(K.AugmentationSequential):
             )
         return result
 
+    def _enters(self, input: Tensor) -> None:
+        """The wavelengths of what comes in: stages behind a filter still ask for them."""
+        self._bands = None
+        if self._stages() and input.ndim >= 3:
+            self._bands = wavelengths_of(input, self.wavelengths)
+
     def forward(self, *args: Any, params: list[ParamItem] | None = None, data_keys: Any = None) -> Any:
         """As `K.AugmentationSequential`."""
         self.transform_op.names = []
         return super().forward(*args, params=params, data_keys=data_keys)
+
+    def _arguments_preproc(self, *args: Any, data_keys: Any, params: Any = None) -> Any:
+        seeing = self.depth and any(
+            isinstance(module, Imaging) or getattr(module, "takes_depth", False) for module in self.children()
+        )
+        for place, (value, key) in enumerate(zip(args, data_keys, strict=False)):
+            if key == DataKey.INPUT and isinstance(value, Tensor):
+                self._enters(value)
+            if key == DataKey.MASK and seeing and self.transform_op.is_depth(place, data_keys):
+                _check_is_depth(value)
+        return super()._arguments_preproc(*args, data_keys=data_keys, params=params)
 
     def _preproc_dict_data(self, data: dict[str, Any]) -> Any:
         prepared = super()._preproc_dict_data(data)
@@ -184,30 +213,56 @@ class _Ops(AugmentationSequentialOps):
                 extra_args = {**extra_args, DataKey.INPUT: own}
         return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
 
-    def _depth(self, arg: Sequence[Any], keys: list[DataKey]) -> Tensor | None:
-        """The mask that is a depth, as it is now."""
+    def _place(self, keys: Sequence[DataKey]) -> int | None:
+        """Which argument is the depth; None where none is."""
         owner = self.owner[0]
         masks = [index for index, key in enumerate(keys) if key == DataKey.MASK]
-        if not owner.depth:
-            return None
         wanted = owner.depth_key
+        if not owner.depth or (wanted is None and not masks):
+            return None
         if wanted is None:
-            if not masks:
-                return None
-            index = masks[0]
+            return masks[0]
+        if isinstance(wanted, str):
+            index = self.names.index(wanted) if wanted in self.names else -1
         else:
-            if isinstance(wanted, str):
-                index = self.names.index(wanted) if wanted in self.names else -1
-            else:
-                index = wanted
-            if index not in masks:
-                raise ValueError(
-                    f"depth_key={wanted!r} is none of the masks of this call, which are at {masks} of "
-                    f"{[key.name for key in keys]}. Give its place in data_keys, or its name in the dict."
-                )
+            index = wanted
+        if index not in masks:
+            raise ValueError(
+                f"depth_key={wanted!r} is none of the masks of this call, which are at {masks} of "
+                f"{[key.name for key in keys]}. Give its place in data_keys, or its name in the dict."
+            )
+        return index
+
+    def is_depth(self, place: int, keys: Sequence[DataKey]) -> bool:
+        """Whether the argument at a place is the depth, in the order in which the caller gave them."""
+        return place == self._place(keys)
+
+    def _depth(self, arg: Sequence[Any], keys: list[DataKey]) -> Tensor | None:
+        """The mask that is a depth, as it is now."""
+        index = self._place(keys)
+        if index is None:
+            return None
         if not isinstance(arg[index], Tensor):
             raise TypeError("the depth is a list of masks of different sizes; expected one tensor (B,1,H,W).")
         return arg[index]
+
+
+def _check_is_depth(mask: Any) -> None:
+    """TypeError for a mask of classes, a warning for one that reaches nearer than a centimetre."""
+    if not isinstance(mask, Tensor):
+        return  # Kornia, or `_depth`, says what is wrong
+    if not mask.is_floating_point():
+        raise TypeError(
+            f"the first mask is taken for inverse depth in 1/m, and is of {mask.dtype}: classes, it seems. Say "
+            "depth=False where it is none, or depth_key= which mask it is."
+        )
+    nearest = float(mask.detach().max()) if mask.numel() else 0.0
+    if nearest > _NEAR:
+        warnings.warn(
+            f"the first mask is taken for inverse depth and reaches {nearest:g} 1/m, {1e3 / nearest:.2g} mm from the "
+            "lens. If it is none, say depth=False.",
+            stacklevel=4,
+        )
 
 
 def _scene(bands: Tensor, depth: Tensor, context: Context) -> Scene:

@@ -1,0 +1,100 @@
+"""What a new user hands in: arrays, wrong scales, masks that are no depth, words that are no argument."""
+
+from __future__ import annotations
+
+import kornia.augmentation as K
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import kcam.augmentation as KC
+from kcam import isp, optics, sensor
+from kcam.units import mm, um
+
+PICTURE = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
+PIXELS = (PICTURE[0].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+MAP = torch.ones(1, 1, 24, 32)
+
+
+@pytest.mark.parametrize("name", ["RandomDefocus", "RandomShotReadNoise", "RandomLensDistortion", "RandomBayer"])
+def test_arrays_become_float32(name: str) -> None:
+    """Kornia makes a picture in the type of a module's first buffer: double would not fit the user's network."""
+    for container in (K.AugmentationSequential, KC.CameraSequential):
+        for given in (PIXELS, Image.fromarray(PIXELS)):
+            assert container(getattr(KC, name)(p=1.0))(given).dtype == torch.float32
+    assert KC.corrupt(PIXELS, "defocus", severity=2).dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", sorted(KC.CORRUPTIONS))
+def test_a_corruption_does_not_depend_on_the_batch(name: str) -> None:
+    alone = KC.corrupt(PICTURE, name, severity=3)
+    assert torch.equal(KC.corrupt(PICTURE.expand(3, -1, -1, -1), name, severity=3)[:1], alone)
+
+
+@pytest.mark.parametrize("bands", [3, 28, 31])
+def test_plain_stages_take_the_bands_that_come_in(bands: int) -> None:
+    lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(8 * mm), focus_distance=2.0)
+    stages = KC.CameraSequential(
+        optics.Imaging(lens, pixel_pitch=4 * um, psf_shape=(9, 9)),
+        sensor.ColourFilter.kodak(),
+        sensor.Mosaic(),
+        isp.Demosaic(),
+        isp.WhiteBalance(),
+    )
+    assert stages(torch.ones(2, bands, 16, 20)).shape == (2, 3, 16, 20)
+
+
+def test_plain_stages_are_told_the_wavelengths() -> None:
+    """Under light of one wavelength a filter gives what its curve has there."""
+    chosen = KC.CameraSequential(sensor.ColourFilter.kodak(), wavelengths=[450e-9, 460e-9])
+    usual = KC.CameraSequential(sensor.ColourFilter.kodak())
+    red, _, blue = chosen(torch.ones(1, 2, 1, 1)).flatten().tolist()
+    assert blue > 5 * red
+    red, _, blue = usual(torch.ones(1, 2, 1, 1)).flatten().tolist()  # 420 and 720 nm
+    assert blue < 5 * red
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: KC.RandomExposure(float("inf")), ValueError, "stops must be .* finite, got"),
+        (lambda: KC.RandomDefocus(p=1.0)(PICTURE * 255), ValueError, r"expected sRGB in \[0,1\]. Use image / 255"),
+        (lambda: KC.RandomVignetting(p=1.0)(PICTURE * torch.nan), ValueError, "Remove NaN and inf"),
+        (lambda: KC.RandomDefocus(p=1.0)(PICTURE, depth=MAP), TypeError, "give inverse_depth=1 / depth"),
+        (lambda: KC.RandomVignetting(p=1.0)(PICTURE, inverse_depth=MAP), TypeError, "takes no inverse_depth"),
+        (lambda: KC.RandomBayer(3), TypeError, "pattern must be"),
+        (lambda: KC.RandomQuantisation(8.5), ValueError, "bits must be whole numbers"),
+        (lambda: KC.RandomQuantisation([8, 10, 12]), ValueError, "bits must be whole numbers"),
+        (lambda: KC.RandomCamera([3]), TypeError, "cameras must be names, files or cameras"),
+        (lambda: KC.corrupt("a.png", "defocus"), TypeError, "Read the file first"),
+        (lambda: KC.corrupt(PICTURE, "defocus", seed="a"), TypeError, "seed must be an integer"),
+        (lambda: KC.RandomDefocus(p=2.0), ValueError, "p must be a probability from 0 to 1"),
+        (lambda: KC.RandomLensDistortion(p="a"), TypeError, "p must be a probability"),
+        (lambda: KC.RandomLensDistortion(resample="cubic"), ValueError, 'resample must be "bilinear" or "nearest"'),
+    ],
+)
+def test_what_cannot_be_meant(call, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_a_mask_of_classes_is_no_depth() -> None:
+    pipeline = KC.CameraSequential(KC.RandomDefocus(p=1.0), data_keys=["input", "mask"])
+    classes = torch.ones(1, 1, 24, 32, dtype=torch.int64)
+    with pytest.raises(TypeError, match="classes, it seems. Say depth=False"):
+        pipeline(PICTURE, classes)
+    with pytest.warns(UserWarning, match=r"reaches 255 1/m, 3.9 mm from the lens"):
+        pipeline(PICTURE, MAP * 255)
+    plain = KC.CameraSequential(KC.RandomDefocus(p=1.0), data_keys=["input", "mask"], depth=False)
+    assert torch.equal(plain(PICTURE, classes)[1], classes)
+    geometry = KC.CameraSequential(K.RandomHorizontalFlip(p=1.0), data_keys=["input", "mask"])
+    assert torch.equal(geometry(PICTURE, classes)[1], classes)  # no stage asks for a depth
+
+
+def test_values_a_little_above_white_are_white() -> None:
+    bright = PICTURE.clone()
+    bright[..., 0, 0] = 1.3
+    result = KC.RandomExposure(0.0, p=1.0)(bright)
+    assert result.max() <= 1
+    assert np.isclose(float(result[..., 0, 0].min()), 1.0)
