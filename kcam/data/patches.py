@@ -640,9 +640,9 @@ def scene_array(folder: Path, document: dict[str, Any], record: dict[str, Any]) 
         if not record["count"]:
             return np.empty(shape, "<u2")
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        if isinstance(error, StoreError):
-            raise
+    except StoreError:
+        raise
+    except Exception as error:  # a damaged header is a TypeError, a SyntaxError and others
         raise StoreError(f"{path} cannot be read: {error}.") from error
     if found.shape != shape or found.dtype != np.dtype("<u2"):
         raise StoreError(f"{path} holds {found.shape} of {found.dtype}, expected {shape} of uint16.")
