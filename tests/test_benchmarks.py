@@ -17,6 +17,7 @@ from rich.console import Console
 sys.path.append(str(Path(__file__).parents[1]))
 
 from benchmarks import bench, peers
+from benchmarks import patches as patch_stores
 from benchmarks.common import Contestant, race
 
 
@@ -162,3 +163,25 @@ def test_what_came_of_a_hard_case_is_said(picture, found):
     assert row["l1"] == (0.5 if found == "finite" else None)
     assert row["message"] == ("ArithmeticError: no light" if picture is None else None)
     assert row["warnings"] == ([] if picture is None else ["UserWarning: thin ice"])
+
+
+# ---- patch stores --------------------------------------------------------------------------------------------------
+
+
+def test_patch_stores_are_timed_side_by_side(tmp_path):
+    assert patch_stores.main(["--quick", "--out", str(tmp_path / "patches.json"), "--folder", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "patches.json").read_text())
+    assert content["patches"] == 2 * 25
+    rows = {(row["store"], row["state"]): row for row in content["reading"]}
+    assert {store for store, _ in rows} == set(patch_stores.STORES)
+    for (store, state), row in rows.items():
+        if state == "skipped":
+            assert store in ("HDF5", "Zarr")
+            continue
+        assert row["patches_per_second"] > 0
+        assert row["rounds"] == 2
+        assert row["kcam_is_faster"] == 1 or store != "kcam store"
+    assert [row["what"] for row in content["extraction"]] == ["extract", "copy"]
+    assert all(row["MB_per_second"] > 0 for row in content["extraction"])
+    assert content["extraction"][0]["bytes"] == 2 * (25 * 4 * 32 * 32 * 2 + 128)
+    assert [path.name for path in tmp_path.iterdir()] == ["patches.json"]
