@@ -16,9 +16,10 @@ from rich.console import Console
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from benchmarks import bench, peers
+from benchmarks import augmentation, bench, peers
 from benchmarks import patches as patch_stores
 from benchmarks.common import Contestant, race
+from kcam import augmentation as KC
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +164,53 @@ def test_what_came_of_a_hard_case_is_said(picture, found):
     assert row["l1"] == (0.5 if found == "finite" else None)
     assert row["message"] == ("ArithmeticError: no light" if picture is None else None)
     assert row["warnings"] == ([] if picture is None else ["UserWarning: thin ice"])
+
+
+# ---- camera augmentations ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def augmented(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    path = tmp_path_factory.mktemp("augmentation") / "augmentation.json"
+    assert augmentation.main(["--quick", "--out", str(path)]) == 0
+    return json.loads(path.read_text())
+
+
+def test_every_augmentation_is_raced_on_pictures_and_cubes(augmented):
+    names = {name for name in KC.__all__ if name.startswith("Random")}
+    for channels, without in ((3, set()), (28, {"RandomColourMatrix"})):
+        lines = {line["augmentation"]: line for line in augmented["lines"] if line["channels"] == channels}
+        assert lines.keys() == names - without
+        for name, line in lines.items():
+            assert {"straightforward", "kcam 1", "kcam simulate 1", "identity 1"} <= line["seconds"].keys()
+            assert all(seconds > 0 for seconds in line["seconds"].values())
+            assert ("0.5" in line["added"]) == (channels == 3 or name not in {"RandomBayer", "RandomCamera"})
+
+
+def test_the_straightforward_way_gives_the_same_picture(augmented):
+    exact = [line for line in augmented["lines"] if line["difference"] is not None]
+    assert len(exact) == 2 * 12 - 1
+    for line in exact:
+        # measured 6e-6: float32 and the PSFs' sampling, each promised to 1e-4 or better; 0 for most
+        assert line["difference"] < 5e-5, line["augmentation"]
+
+
+@pytest.mark.parametrize(
+    ("whole", "met", "without_light"), [(13.5, True, False), (8.5, True, True), (29.0, False, False)]
+)
+def test_what_we_add_is_beyond_identity_and_maths(whole, met, without_light):
+    seconds = {"kcam 1": whole, "kcam simulate 1": 4.0, "identity 1": 1.0, "light": 5.0}
+    found = augmentation.added({who: {"seconds": value} for who, value in seconds.items()}, 1.0)
+    assert found["seconds"] == pytest.approx(whole - 10.0)
+    assert found["maths"] == 9.0
+    assert (found["met"], found["met_without_light"]) == (met, without_light)
+
+
+def test_half_of_the_rows_are_drawn_at_one_half():
+    for batch in (2, 8):
+        torch.manual_seed(augmentation.half_of_the_rows(batch))
+        params = KC.RandomDefocus(p=0.5).forward_parameters(torch.Size((batch, 3, 8, 8)))
+        assert int(params["batch_prob"].sum()) == batch // 2
 
 
 # ---- patch stores --------------------------------------------------------------------------------------------------

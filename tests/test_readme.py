@@ -17,6 +17,7 @@ import typer
 from PIL import Image
 
 import kcam
+from kcam import augmentation as KC
 from kcam import cli, demo, isp, optics, sensor
 from kcam.camera import PRESETS
 from kcam.scene import BUILTIN
@@ -30,6 +31,8 @@ EXAMPLES = {
     "train_doe": ["--steps", "4", "--out", "doe.png"],
     "compose_camera": ["--size", "40", "--out", "cameras.png"],
     "psf_gallery": ["--pixels", "21", "--out", "gallery.png"],
+    "augmentation_gallery": ["--side", "40", "--out", "augmentations.png"],
+    "train_segmentation": ["--quick", "--out", "training.json"],
     "plan_scenes": ["--size", "40", "--out", "plans"],
 }
 
@@ -230,6 +233,24 @@ def test_benchmark_table_shows_losses_and_missed_targets() -> None:
     assert "- twice as fast: **missed**, met in 0 of 1 races; 0.5 to 0.5 times as fast." in table
     assert "- easy: met in 1 of 1 races; 2 to 2 times as fast." in table
     assert generate.benchmark_part({"other": 1}, generate.RESULTS / "x.json") == ""
+
+
+def test_augmentation_cells_show_what_is_faster_and_what_is_missed() -> None:
+    line = {
+        "seconds": {"kcam 1": 0.02, "straightforward": 0.015, "a": 0.03, "b": 0.04},
+        "relatives": ["a", "b"],
+        "added": {"1": {"share_of_maths": 0.25, "met": True}, "0.5": {"share_of_maths": 1.5, "met": False}},
+    }
+    assert generate.speed_cells(line) == ["20", "30", "**15**", "0.25 met, **1.50 missed**"]
+    assert generate.speed_cells(None) == ["", "", "", ""]
+
+
+def test_every_augmentation_is_in_its_tables_and_in_the_gallery() -> None:
+    names = {name for name in KC.__all__ if name.startswith("Random")}
+    assert {cls.__name__ for cls in generate.augmentations()} == names
+    speed = generate.augmentation_speed_table()
+    assert all(f"`{name}`" in speed for name in names)
+    assert names <= load(ROOT / "examples" / "augmentation_gallery.py").GALLERY.keys()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 import sys
 import warnings
 from pathlib import Path
@@ -25,19 +24,6 @@ CASSI = torch.tensor(CASSI, dtype=torch.float64) * nm
 FINE = torch.arange(360, 831, dtype=torch.float64) * nm
 
 grids = st.lists(st.integers(3600, 8300), min_size=1, max_size=40, unique=True)
-
-
-@pytest.fixture(scope="session")
-def tables() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_tables", Path(__file__).parents[1] / "tools" / "make_tables.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="session")
-def colour(tables: ModuleType) -> ModuleType:
-    return tables.import_colour()
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,9 @@
 """What all camera augmentations share: pictures in linear light, work for drawn rows only, noise from seeds.
 
 A tensor of 3 channels (or 1, gray) is a *picture*: sRGB, coded, in [0,1]. It is taken to linear light, and back, where
-the physics needs it; the result lies in [0,1]. Any other number of channels is a *cube*: spectral bands of linear light
-on which a perfect white is 1, from 420 to 720 nm in equal steps unless `wavelengths` says otherwise.
+the physics needs it; the result lies in [0,1]. Any other number of channels is a *cube*: spectral bands of light, from
+420 to 720 nm in equal steps unless `wavelengths` says otherwise. A perfect white has the spectrum of daylight with
+Y = 1, as in `Scene.from_bands`: about 1 in each band, not 1.
 """
 
 from __future__ import annotations
@@ -112,13 +113,14 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         rows = gate.nonzero().flatten()
         if rows.numel() == 0:
             return input
-        result = function(input[rows.to(input.device)], {name: value[rows] for name, value in drawn.items()})
+        here = rows.to(input.device)
+        result = function(input.index_select(0, here), {name: value[rows] for name, value in drawn.items()})
         if result.shape[1:] != input.shape[1:]:
             raise ValueError(
                 f"{type(self).__name__} turns {input.shape[1]} channels into {result.shape[1]}, which only some rows "
                 f"of a batch cannot have. Use p=1.0, not p={self.p:g}."
             )
-        return input.index_copy(0, rows.to(input.device), result)
+        return input.index_copy(0, here, result)
 
     def _drawn(self, params: dict[str, Any]) -> dict[str, Tensor]:
         """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""

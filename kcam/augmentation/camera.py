@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,11 +16,13 @@ from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
 from kcam.augmentation.optics import check_inverse_depth
 from kcam.augmentation.sensor import announced
 from kcam.camera import PRESETS, Camera
+from kcam.planner.making import check_tolerance
 from kcam.scene import Scene
 from kcam.ste import clip_ste
 from kcam.units import wavelength_grid
 
 _NEAREST_VERGENCE = 1e-9  # 1/m: a map's 0 is infinity
+_PLANS = 64  # kept
 _SCENE = "coffee"  # what is planned for: detail of all sizes, saturated colours
 
 
@@ -31,7 +34,8 @@ class RandomCamera(CameraAugmentation):
     ``augment(image, inverse_depth=map)`` (B,1,H,W) [1/m], takes the place of the drawn distance.
 
     Each camera is planned once for each size of picture, on a fixed scene at both ends of the range of distances, never
-    for a batch: the result for a sample does not depend on the others.
+    for a batch: the result for a sample does not depend on the others. With a map it is planned from infinity to the
+    near end of that range, or for a nearer map, to the next power of 2 [1/m] beyond its nearest point.
 
     Args:      cameras: presets by name, files that `Camera.save` wrote, or cameras. Presets and files are not trained;
                    a camera of one's own keeps its parameters, and gradients reach them.
@@ -60,6 +64,7 @@ class RandomCamera(CameraAugmentation):
             cameras = [cameras]
         if not cameras:
             raise ValueError('cameras is empty: give at least one, such as cameras=["phone"].')
+        check_tolerance(tolerance)
         draws: dict[str, Draw] = {
             "camera": Choice(len(cameras)),
             "distance": Uniform(distance, "vergence", least=1e-2, unit="[m]"),
@@ -85,15 +90,22 @@ class RandomCamera(CameraAugmentation):
         """What is drawn, and for Kornia's containers the shape of the picture."""
         return super().generate_parameters(batch_shape) | announced(self, batch_shape)
 
-    def planned(self, index: int, signal: Tensor, *, depth: bool = False) -> Camera:
-        """The camera that photographs such signals: with its plan for their size, made when it is first asked for."""
+    def planned(self, index: int, signal: Tensor, *, nearest: float | None = None) -> Camera:
+        """The camera that photographs such signals: with its plan for their size, made when it is first asked for.
+
+        nearest: the largest value of a map [1/m]; None without one.
+        """
         shape, bands = (signal.shape[-2], signal.shape[-1]), None if is_picture(signal) else self._bands(signal)
-        key = (index, shape, depth, None if bands is None else tuple(bands.tolist()))
+        near, far = (1 / bound for bound in self.bounds("distance"))
+        beyond = None  # what of the map lies nearer than the range; the range itself may be trained
+        if nearest is not None:
+            beyond = 2.0 ** math.ceil(math.log2(nearest)) if nearest > near else 0.0
+            near, far = max(near, beyond), 0.0
+        key = (index, shape, beyond, None if bands is None else tuple(bands.tolist()))
         if key not in self._planned:
             camera: Any = self.cameras[index]
             scene = Scene.builtin(_SCENE, shape, wavelengths=bands).to(device=signal.device)
-            near, far = (1 / bound for bound in self.bounds("distance"))
-            if depth:
+            if nearest is not None:
                 ramp = torch.linspace(far, near, shape[1], dtype=torch.float64).clamp(min=_NEAREST_VERGENCE)
                 scenes = [scene.with_depth((1 / ramp).expand(1, 1, *shape).to(signal.device))]
             else:
@@ -101,21 +113,24 @@ class RandomCamera(CameraAugmentation):
             plan = camera.plan(scenes, tolerance=self.tolerance)
             # a plain camera: a PlannedCamera would warn of each picture that is not like the fixed scene
             self._planned[key] = Camera(*plan.apply(camera), context=camera.resolve())
+        if len(self._planned) > _PLANS:  # of pictures of ever other sizes, the oldest goes
+            del self._planned[next(iter(self._planned))]
         return self._planned[key]
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Row by row, each with its own camera, distance and seed."""
-        depths: Sequence[float | Tensor] = drawn["distance"].tolist()
-        mapped = "inverse_depth" in drawn
-        if mapped:
+        distance = drawn["distance"]
+        depths: Sequence[float | Tensor] = distance.unbind() if distance.requires_grad else distance.tolist()
+        nearest: Sequence[float | None] = [None] * len(signal)
+        if "inverse_depth" in drawn:
             vergence = check_inverse_depth(drawn["inverse_depth"], signal).double().clamp(min=_NEAREST_VERGENCE)
-            depths = (1 / vergence).split(1)
+            depths, nearest = (1 / vergence).split(1), vergence.detach().amax((1, 2, 3)).tolist()
         generators = each_generator(drawn["noise_seed"], signal.device)
         pictures = []
-        for row, index, depth, generator in zip(
-            signal.split(1), drawn["camera"].tolist(), depths, generators, strict=True
+        for row, index, depth, near, generator in zip(
+            signal.split(1), drawn["camera"].tolist(), depths, nearest, generators, strict=True
         ):
-            picture = self.planned(index, signal, depth=mapped)(self._scene(row, depth), generator=generator)
+            picture = self.planned(index, signal, nearest=near)(self._scene(row, depth), generator=generator)
             if picture.shape[1] != 3:
                 raise ValueError(
                     f"camera {index} of RandomCamera ends in {picture.shape[1]} channels, expected a picture of 3. Add "

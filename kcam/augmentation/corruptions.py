@@ -87,7 +87,7 @@ def corrupt(image: Any, corruption: str, *, severity: int = 1, seed: int = 0) ->
         raise ValueError(f"unknown corruption {corruption!r}. There are: {', '.join(CORRUPTIONS)}.")
     if isinstance(severity, bool) or severity not in (1, 2, 3, 4, 5):
         raise ValueError(f"severity must be 1, 2, 3, 4 or 5, got {severity!r}.")
-    pipeline = K.ImageSequential(CORRUPTIONS[corruption].build(severity), keepdim=True)
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
+    pipeline = K.ImageSequential(CORRUPTIONS[corruption].build(int(severity)), keepdim=True)
+    with torch.random.fork_rng(devices=[]):  # all is drawn on the CPU; a worker must not wake a GPU
+        torch.default_generator.manual_seed(seed)
         return pipeline(image)

@@ -41,7 +41,7 @@ class Uniform:
         if values.ndim > 1 or len(found) not in (1, 2):
             raise ValueError(f"{name} must be {expected}, got shape {tuple(values.shape)}.")
         low, high = found[0], found[-1]
-        if not (self.least <= low <= high <= self.most):
+        if not self.allows(self.bounds if isinstance(self.bounds, Tensor) else values):
             raise ValueError(
                 f"{name} must be {expected} with {self.least:g} <= low <= high <= {self.most:g}, "
                 f"got ({low:g}, {high:g})."
@@ -51,6 +51,12 @@ class Uniform:
                 raise ValueError(f"{name} as a parameter must be (2,), its two bounds, got {tuple(values.shape)}.")
             return self.bounds
         return torch.tensor([low, high], dtype=torch.float64)
+
+    def allows(self, bounds: Tensor) -> bool:
+        """Whether these bounds are within least and most, to their type's rounding: float32's 0.49 is above 0.49."""
+        low, high = bounds.detach().double().flatten()[[0, -1]].tolist()
+        slack = torch.finfo(bounds.dtype if bounds.is_floating_point() else torch.float64).eps
+        return self.least - slack * abs(self.least) <= low <= high <= self.most + slack * abs(self.most)
 
     def between(self, bounds: Tensor, share: Tensor) -> Tensor:
         """The number a share of the way from the lower bound to the upper one."""
@@ -130,8 +136,8 @@ class Draws(RandomGeneratorBase):
         for name, draw in self.draws.items():
             if isinstance(draw, Uniform):
                 bounds = getattr(self, name)
-                low, high = bounds.detach().tolist()
-                if not (draw.least <= low and high <= draw.most and low <= high):
+                if not draw.allows(bounds):
+                    low, high = self.bounds(name)
                     raise ValueError(
                         f"{name} was trained or loaded to ({low:g}, {high:g}), outside {draw.least:g} <= low <= high "
                         f"<= {draw.most:g}. Clamp it after each step."

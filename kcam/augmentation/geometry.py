@@ -18,7 +18,7 @@ from kcam.augmentation.draws import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
 _ITERATIONS = 40  # of the inverse, a fixed point, at most
-_TOLERANCE = 0.01  # of the inverse at the picture's border, where it converges last [pixels]
+_TOLERANCE = 0.01  # of the inverse, at probes all over the picture [pixels]
 _EDGE_SAMPLES = 9  # of a box's edge: a straight edge becomes a curve
 
 
@@ -35,7 +35,7 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
                focal_length: of the lens in units of the picture's longer side; 1 is a field of 53 degrees.
                resample: of the picture, "bilinear" or "nearest".
     Raises:    ValueError at the call where the drawn coefficients fold the picture over itself, or nearly so (the
-        inverse does not converge to 0.01 pixels at the border).
+        inverse does not converge to 0.01 pixels).
     Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
     """
 
@@ -68,16 +68,16 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         if batch_shape[0] and not torch.compiler.is_compiling():
             with torch.no_grad():
                 camera, coefficients = self._lens(drawn, (height, width), torch.device("cpu"))
-                border = _border((height, width)).expand(len(coefficients), -1, -1)
-                ideal = undistort_points(border, camera, coefficients, num_iters=_ITERATIONS)
-                missed = (distort_points(ideal, camera, coefficients) - border).abs().amax((1, 2))
+                probes = _probes((height, width)).expand(len(coefficients), -1, -1)
+                ideal = undistort_points(probes, camera, coefficients, num_iters=_ITERATIONS)
+                missed = (distort_points(ideal, camera, coefficients) - probes).abs().amax((1, 2))
             bad = ~(missed < _TOLERANCE)
             if bad.any():
                 k1, k2, p1, p2 = coefficients[bad][0].tolist()
                 raise ValueError(
                     f"k1 = {k1:.3g}, k2 = {k2:.3g}, p1 = {p1:.3g}, p2 = {p2:.3g} fold the picture over itself, or "
-                    f"nearly so: its border has no one point that is imaged there. Use coefficients of half the size, "
-                    f"or focal_length={1.5 * self.focal_length:.3g}."
+                    f"nearly so: some pixels have no one point that is imaged there. Use coefficients of half the "
+                    f"size, or focal_length={1.5 * self.focal_length:.3g}."
                 )
         return drawn
 
@@ -108,18 +108,53 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         self, input: Keypoints, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Keypoints:
         """Each point to where the lens images it."""
-        output = input.clone()
-        output._data = self._moved(input.data, params).to(input.data.dtype)
-        return output
+        return self._moved_keypoints(input, params, inverse=False)
+
+    def inverse_keypoints(
+        self,
+        input: Keypoints,
+        params: dict[str, Tensor] | None,
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+        **kwargs,
+    ) -> Keypoints:
+        """Each point to where the ideal lens images it."""
+        params = self._params if params is None else params
+        moved = self._moved_keypoints(input, params, inverse=True)
+        moved._data = self._blend_by_prob(moved.data, input.data, self._gate(params))
+        return moved
+
+    def inverse_boxes(
+        self,
+        input: Boxes,
+        params: dict[str, Tensor] | None,
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+        **kwargs,
+    ) -> Boxes:
+        """The upright box around the edges where the ideal lens images them."""
+        params = self._params if params is None else params
+        moved = self._moved_boxes(input, params, inverse=True)
+        moved._data = self._blend_by_prob(moved.data, input.data, self._gate(params))
+        return moved
 
     def apply_transform_box(
         self, input: Boxes, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Boxes:
         """The upright box around the moved edges."""
+        return self._moved_boxes(input, params, inverse=False)
+
+    def _moved_keypoints(self, input: Keypoints, params: dict[str, Tensor], *, inverse: bool) -> Keypoints:
+        output = input.clone()
+        output._data = self._moved(input.data, params, inverse=inverse).to(input.data.dtype)
+        return output
+
+    def _moved_boxes(self, input: Boxes, params: dict[str, Tensor], *, inverse: bool) -> Boxes:
         corners = input.data  # (B, N, 4, 2) in turn around the box
         share = torch.linspace(0, 1, _EDGE_SAMPLES, dtype=corners.dtype, device=corners.device)[:, None]
         edges = corners[..., None, :] + (corners.roll(-1, dims=-2) - corners)[..., None, :] * share
-        moved = self._moved(edges.flatten(1, -2), params).to(corners.dtype).view(*edges.shape[:2], -1, 2)
+        moved = self._moved(edges.flatten(1, -2), params, inverse=inverse)
+        moved = moved.to(corners.dtype).view(*edges.shape[:2], -1, 2)
         (left, top), (right, bottom) = moved.amin(-2).unbind(-1), moved.amax(-2).unbind(-1)
         output = input.clone()
         output._data = torch.stack(
@@ -137,13 +172,15 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         )
         return camera.to(device).expand(len(coefficients), 3, 3), coefficients
 
-    def _moved(self, points: Tensor, params: dict[str, Tensor]) -> Tensor:
-        """Points (B, ..., 2) in pixels to where the lens images them."""
+    def _moved(self, points: Tensor, params: dict[str, Tensor], *, inverse: bool) -> Tensor:
+        """Points (B, ..., 2) in pixels to where the lens images them, or from there."""
         if points.numel() == 0:
             return points
         height, width = params["forward_input_shape"][-2:].tolist()
         camera, coefficients = self._lens(params, (height, width), points.device)
         flat = points.double().flatten(1, -2)
+        if inverse:
+            return undistort_points(flat, camera, coefficients, num_iters=_ITERATIONS).view(points.shape)
         return distort_points(flat, camera, coefficients).view(points.shape)
 
     def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:
@@ -171,18 +208,18 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
 
 @torch.no_grad()
 def _iterations(shape: tuple[int, int], camera: Tensor, coefficients: Tensor) -> int:
-    """Of the inverse, until the picture's border, where it converges last, is good to 1e-4 pixels."""
-    border = _border(shape).to(camera.device).expand(len(coefficients), -1, -1)
-    last = border
+    """Of the inverse, until all probes are good to 1e-4 pixels."""
+    probes = _probes(shape).to(camera.device).expand(len(coefficients), -1, -1)
+    last = probes
     for count in range(4, _ITERATIONS, 4):
-        here = undistort_points(border, camera, coefficients, num_iters=count)
+        here = undistort_points(probes, camera, coefficients, num_iters=count)
         if float((here - last).abs().max()) < 1e-4:
             return count
         last = here
     return _ITERATIONS
 
 
-def _border(shape: tuple[int, int]) -> Tensor:
-    """Corners and middles of a picture's sides, (9, 2) as x, y."""
+def _probes(shape: tuple[int, int]) -> Tensor:
+    """Points of a picture's sides and of its inside, (81, 2) as x, y: decentred, a lens is at its worst anywhere."""
     height, width = shape
-    return torch.cartesian_prod(*(torch.linspace(0, n - 1, 3, dtype=torch.float64) for n in (width, height)))
+    return torch.cartesian_prod(*(torch.linspace(0, n - 1, 9, dtype=torch.float64) for n in (width, height)))

@@ -136,10 +136,14 @@ class RandomToneCurve(CameraAugmentation):
         super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
-        """Values are clipped to 0..1 first, outside of which the curve would turn."""
-        gamma, contrast = (drawn[name].to(signal)[:, None, None, None] for name in ("gamma", "contrast"))
-        inside = signal.clamp(0, 1)
-        offset = 0.01
-        low = offset**gamma
-        tone = ((inside + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
-        return tone + 2 * contrast * tone * (1 - tone) * (2 * tone - 1)
+        """Values are clipped to 0..1 first, outside of which the curve would turn; row by row, which stays in cache."""
+        gammas, contrasts = (drawn[name].to(signal).unbind() for name in ("gamma", "contrast"))
+        rows = zip(signal, gammas, contrasts, strict=True)
+        return torch.stack([_tone(row, gamma=gamma, contrast=contrast) for row, gamma, contrast in rows])
+
+
+def _tone(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
+    offset = 0.01
+    low = offset**gamma
+    tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
+    return tone + 2 * contrast * tone * (1 - tone) * (2 * tone - 1)

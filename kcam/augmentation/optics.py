@@ -52,7 +52,11 @@ class RandomBlur(CameraAugmentation):
 
     def psf_shape(self, picture: tuple[int, int], wavelengths: Tensor) -> tuple[int, int]:
         """Window of the PSFs [pixels], for the worst that the ranges hold, so that it does not depend on the batch."""
-        half = math.ceil(self.widest(wavelengths) / self.pixel_pitch)
+        return self.window(picture, self.widest(wavelengths))
+
+    def window(self, picture: tuple[int, int], width: float) -> tuple[int, int]:
+        """Pixels for PSFs of this half width [m]: odd, no more than the picture."""
+        half = math.ceil(width / self.pixel_pitch)
         height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
         return height, width
 
@@ -75,17 +79,29 @@ class RandomBlur(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """One depth: each channel of each sample with its PSF."""
+        return convolve(signal, self.kernels(signal, drawn)[:, 0])
+
+    @torch.compiler.disable  # its sizes follow from numbers, at each of which a graph would break
+    def kernels(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """The PSFs for a signal, (B, Z, L, h, w)."""
         wavelengths = wavelengths_of(signal, self.wavelengths)
         shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
-        psfs = self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
-        return convolve(signal, psfs[:, 0])
+        return self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
 
 
 def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
     """Each channel of each picture (B,C,H,W) with its own PSF (B,C,h,w), upright; beyond the border it is reflected."""
     picture, window = (signal.shape[-2], signal.shape[-1]), (psfs.shape[-2], psfs.shape[-1])
     sizes = Convolution.of(picture, window, border="reflect", itemsize=signal.element_size(), max_memory=2e9)
-    return sizes.back(sizes.transform(signal) * sizes.transfer(psfs))
+    planes, kernels = signal.flatten(0, 1)[:, None], psfs.flatten(0, 1)[:, None]
+    # few planes at once stay in a CPU's cache: three times as fast on 28 bands; a GPU wants many
+    split = signal.device.type == "cpu" and not torch.compiler.is_compiling()
+    at_once = sizes.bands if split else len(planes)
+    parts = [
+        sizes.back(sizes.transform(some) * sizes.transfer(their))
+        for some, their in zip(planes.split(at_once), kernels.split(at_once), strict=True)
+    ]
+    return torch.cat(parts).view(signal.shape)
 
 
 class RandomDefocus(RandomBlur):
@@ -151,11 +167,18 @@ class RandomDefocus(RandomBlur):
         self.flags |= {"layers": layers}
 
     def widest(self, wavelengths: Tensor) -> float:
-        """The blur of the widest aperture, or the diffraction of the narrowest."""
+        """At the worst of the range of distances."""
+        low, high = self.bounds("distance")
+        return self.reach(1 / high, 1 / low, wavelengths=wavelengths)
+
+    def reach(self, low: float, high: float, *, wavelengths: Tensor) -> float:
+        """Half width of the largest PSF of objects at these vergences [1/m] and between, in the ranges of the lens [m].
+
+        It is the blur of the widest aperture, or the diffraction of the narrowest.
+        """
         shortest, longest = self.bounds("focal_length")
         near, far = (1 / bound for bound in self.bounds("focus"))
-        ends = [1 / bound for bound in self.bounds("distance")]
-        most = max(abs(end - focus) for end in ends for focus in (near, far))
+        most = max(abs(end - focus) for end in (low, high) for focus in (near, far))
         sensor_distance = 1 / (1 / longest - near)
         widths = []
         for number in self.bounds("f_number"):
@@ -182,24 +205,33 @@ class RandomDefocus(RandomBlur):
         if "inverse_depth" not in drawn:
             return super().simulate(signal, drawn)
         depth = check_inverse_depth(drawn["inverse_depth"], signal).double()
-        wavelengths = wavelengths_of(signal, self.wavelengths)
-        low, high = depth.amin((1, 2, 3)), depth.amax((1, 2, 3))
-        share = torch.linspace(0, 1, self.layers, dtype=torch.float64, device=depth.device)
-        if self.layers == 1:
-            share = share + 0.5
-        vergences = low[:, None] + (high - low)[:, None] * share
-        shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
-        psfs = self.psfs(drawn | {"vergences": vergences}, wavelengths=wavelengths, shape=shape, like=signal)
         rows = []
         for index in range(len(signal)):
-            shares = None
-            if self.layers > 1 and high[index] > low[index]:
-                shares = layer_shares(depth[index : index + 1], vergences[index]).to(signal)
-            layers = Layers(signal[index : index + 1], shares)
-            renderer = Renderer(psfs[index], spectra=None, weights=None, picture=(signal.shape[-2], signal.shape[-1]))
+            row = slice(index, index + 1)
+            own = {name: value[row] for name, value in drawn.items()} | {"inverse_depth": depth[row]}
+            vergences, psfs = self.layered(signal[row], own)
+            low, high = vergences[0], vergences[-1]
+            shares = None if len(vergences) == 1 or low == high else layer_shares(depth[row], vergences).to(signal)
+            layers = Layers(signal[row], shares)
+            renderer = Renderer(psfs, spectra=None, weights=None, picture=(signal.shape[-2], signal.shape[-1]))
             layers.add(renderer, first=0)
             rows.append(layers.light)
         return torch.cat(rows)
+
+    @torch.compiler.disable
+    def layered(self, signal: Tensor, drawn: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """For one sample and its map: vergences of the layers (Z,) [1/m], and their PSFs (Z, L, h, w).
+
+        The window is that of this map, which may reach beyond the range of distances.
+        """
+        low, high = drawn["inverse_depth"].aminmax()
+        share = torch.linspace(0, 1, self.layers, dtype=low.dtype, device=low.device)
+        vergences = low + (high - low) * (share if self.layers > 1 else share + 0.5)
+        wavelengths = wavelengths_of(signal, self.wavelengths)
+        width = self.reach(float(low.detach()), float(high.detach()), wavelengths=wavelengths)
+        shape = self.window((signal.shape[-2], signal.shape[-1]), width)
+        drawn = drawn | {"vergences": vergences[None]}
+        return vergences, self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)[0]
 
 
 def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:
@@ -317,7 +349,7 @@ class RandomAberration(FocusedBlur):
 
     W = sum_j c_j Z_j,   sum_j c_j^2 = (rms 550 nm)^2,   in a direction that is uniform on the sphere
 
-    Args:      rms: of the wavefront [waves at 550 nm]; 0.07 is the limit of what counts as diffraction limited.
+    Args:      rms: of the wavefront [waves at 550 nm], up to 5; 0.07 is what counts as diffraction limited.
                f_number, focal_length, pixel_pitch: of the lens. Others: as for `RandomBlur`.
     Source:    Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
@@ -338,7 +370,7 @@ class RandomAberration(FocusedBlur):
         keepdim: bool = False,
     ) -> None:
         super().__init__(
-            {"rms": Uniform(rms, least=0.0, most=50.0, unit="[waves]"), "direction": Normal(self.TERMS)},
+            {"rms": Uniform(rms, least=0.0, most=5.0, unit="[waves]"), "direction": Normal(self.TERMS)},
             f_number=f_number,
             focal_length=focal_length,
             pixel_pitch=pixel_pitch,
@@ -355,8 +387,11 @@ class RandomAberration(FocusedBlur):
         return F.pad(direction * drawn["rms"].double()[:, None].to(direction) * DESIGN, (3, 0))
 
     def slope(self, wavelengths: Tensor, *, radius: float) -> float:
-        """A Zernike of order n rises by up to n sqrt(2 n + 2) times its RMS at the rim; here n is at most 4."""
-        return self.bounds("rms")[1] * DESIGN * 4 * math.sqrt(10) / radius
+        """The steepest sum of Z4 to Z15 rises by 20 RMS / a at 0.8 a, the mean one by 15 at the rim.
+
+        At 2 waves nine draws of ten then send less than 1.1 % of their light farther; the worst of 60 sent 2.4 %.
+        """
+        return self.bounds("rms")[1] * DESIGN * 20 / radius
 
 
 class RandomChromaticAberration(FocusedBlur):

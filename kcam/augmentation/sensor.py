@@ -23,15 +23,16 @@ BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
 class RandomBayer(CameraAugmentation):
     """Mosaic and demosaic: what a sensor of one colour per pixel loses.
 
-    A picture is mosaiced in linear light and filled in again. A cube of bands becomes a picture: through the colour
-    filter, the mosaic and the demosaic, white balance, colour matrix and tone curve of a noiseless camera.
+    A picture is mosaiced in linear light and filled in again, on its square root as by `isp.demosaic`. A cube of bands
+    becomes a picture: through the colour filter, the mosaic and the demosaic, white balance, colour matrix and tone
+    curve of a noiseless camera.
 
     Args:      pattern: "random" for one of the four phases of the Bayer pattern, a name in `sensor.PATTERNS` (of three
                    channels on pictures), or several names.
                method: a name in `isp.DEMOSAICS`; None for the default of the pattern.
                colour_filter: for cubes; None for `ColourFilter.kodak()`, or `rgbw()` for the pattern of that name.
                wavelengths: of a cube's bands [m].
-    Raises:    ValueError for an unknown pattern or method; at the call, for a cube with p < 1.
+    Raises:    ValueError for an unknown pattern or method, or none; at the call, for a cube with p < 1.
     """
 
     def __init__(
@@ -46,6 +47,8 @@ class RandomBayer(CameraAugmentation):
         keepdim: bool = False,
     ) -> None:
         names = BAYER if pattern == "random" else (pattern,) if isinstance(pattern, str) else tuple(pattern)
+        if not names:
+            raise ValueError(f'pattern is empty: give "random", or at least one of {", ".join(BAYER)}.')
         for name in names:
             Demosaic(method, pattern=name)  # refuses what does not exist
         super().__init__({"pattern": Choice(len(names))}, same_on_batch=same_on_batch, p=p, keepdim=keepdim)

@@ -125,7 +125,14 @@ class CameraSequential(K.AugmentationSequential):
         return not isinstance(module, (_AugmentationBase, K.MixAugmentationBaseV2, ImageSequentialBase))
 
     def run(self, module: nn.Module, input: Tensor, *, depth: Tensor | None) -> Tensor:
-        """A plain module; a stage is told of its neighbours, and an Imaging of the depth."""
+        """A plain module; a stage is told of its neighbours, and an Imaging of the depth.
+
+        A picture (C,H,W) or (H,W), which no augmentation has yet made a batch of, is one for as long.
+        """
+        if input.ndim < 4:
+            result = self.run(module, input.reshape((1,) * (4 - input.ndim) + input.shape), depth=depth)
+            alone = result[0]
+            return alone[0] if input.ndim == 2 and alone.shape[0] == 1 else alone
         channels = input.shape[1]
         if isinstance(module, Stage):
             context = self.context()
@@ -143,12 +150,13 @@ class CameraSequential(K.AugmentationSequential):
 
     def forward(self, *args: Any, params: list[ParamItem] | None = None, data_keys: Any = None) -> Any:
         """As `K.AugmentationSequential`."""
-        names = list(args[0]) if len(args) == 1 and isinstance(args[0], dict) else None
-        self.transform_op.names = names
-        try:
-            return super().forward(*args, params=params, data_keys=data_keys)
-        finally:
-            self.transform_op.names = None
+        self.transform_op.names = []
+        return super().forward(*args, params=params, data_keys=data_keys)
+
+    def _preproc_dict_data(self, data: dict[str, Any]) -> Any:
+        prepared = super()._preproc_dict_data(data)
+        self.transform_op.names = list(prepared[0])  # without the keys that Kornia passes through: places count
+        return prepared
 
 
 class _Ops(AugmentationSequentialOps):
@@ -157,7 +165,7 @@ class _Ops(AugmentationSequentialOps):
     def __init__(self, data_keys: list[DataKey] | None, owner: CameraSequential) -> None:
         super().__init__(data_keys)
         self.owner = [owner]  # in a list: a module in an attribute would be its child
-        self.names: list[str] | None = None
+        self.names: list[str] = []
 
     def transform(self, *arg: Any, module: nn.Module, param: ParamItem, extra_args: Any, data_keys: Any = None) -> Any:
         owner = self.owner[0]
@@ -189,7 +197,7 @@ class _Ops(AugmentationSequentialOps):
             index = masks[0]
         else:
             if isinstance(wanted, str):
-                index = (self.names or []).index(wanted) if wanted in (self.names or []) else -1
+                index = self.names.index(wanted) if wanted in self.names else -1
             else:
                 index = wanted
             if index not in masks:

@@ -34,7 +34,7 @@ def parse_bands(text: str) -> np.ndarray:
         start, stop, count = text.split(":")
         first, last, number = float(start), float(stop), int(count)
         if number < 1 or not (0 < first <= last) or (number > 1 and first == last):
-            raise ValueError
+            raise ValueError("not ascending")
     except ValueError as error:
         raise ValueError(f"bands {text!r} is not start:stop:count in nm, such as 420:720:28.") from error
     return wavelength_grid(list(np.linspace(first, last, number) * nm)).numpy()

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 import torch
+from scipy.special import fresnel
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from kcam.optics import sampling
 from kcam.optics.elements import zernike_sum
@@ -19,7 +19,8 @@ from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 
 _STEP = math.pi / 24  # of t in the table of J0: |U|^2 by cubic interpolation is then good to 1e-4 of its fringes
 _PROFILE_STEPS = 16  # of the profile for each of its fringes; cubic between them
-_KEPT_TABLE, _LARGEST_TABLE = 2**22, 2**31  # entries: 34 MB; a minute
+_KEPT_TABLE = 2**22  # entries of a table of J0: 34 MB
+_MOST_FRINGES = 2**20
 
 
 def batch_psf(
@@ -74,57 +75,72 @@ def batch_psf(
     if coefficients is None:
         return _radial_bank(residual, a=a, d=d, grid=grid, pixel_pitch=pixel_pitch, shape=shape, dtype=dtype)
 
-    def zernikes(x: Tensor, y: Tensor) -> list[Tensor]:
-        pupil = Pupil(x, y, torch.ones_like(a[0]), torch.ones_like(a[0]), paraxial=True)
-        count = 0 if coefficients is None else coefficients.shape[1]
-        unit = torch.eye(count, dtype=torch.float64, device=device)
-        return [pupil.rho2, *(zernike_sum(unit[j], pupil) for j in range(count))]
-
+    terms = coefficients.shape[1]
     # OPD as coefficients of rho^2 and of the Zernikes, (B, 1 or L, Z, T)
     opd = (residual.transpose(1, 2) * a[:, None, None] ** 2 / 2)[..., None]
-    if coefficients is not None:
-        own = coefficients.to(device, torch.float64)[:, None, None].expand(-1, opd.shape[1], layers, -1)
-        opd = torch.cat([opd, own], dim=-1)
+    own = coefficients.to(device, torch.float64)[:, None, None].expand(-1, opd.shape[1], layers, -1)
+    opd = torch.cat([opd, own], dim=-1)
     with torch.no_grad():
-        side = torch.linspace(-1, 1, 65, dtype=torch.float64, device=device)
-        coarse = torch.stack(zernikes(side[None, :], side[:, None]))
-        inside = (side[None, :] ** 2 + side[:, None] ** 2 <= 1.0001).flatten()
+        side = torch.linspace(-1, 1, 65, dtype=torch.float64)
+        coarse = _zernike_maps(side, terms).to(device)
+        inside = (side[None, :] ** 2 + side[:, None] ** 2 <= 1.0001).flatten().to(device)
         slopes = [
             (opd @ g.flatten(1)[:, inside]).square() for g in torch.gradient(coarse, spacing=2 / 64, dim=(-2, -1))
         ]
         displacement = torch.stack(slopes).sum(0).sqrt().amax(dim=(1, 2, 3)) * d / a
-        widest = a / d
-        half_window = (max(shape) // 2 + sampling.WINDOW_MARGIN) * pixel_pitch
-        shortest = float(grid.min())
-        count = max(
-            sampling.pupil_samples(
-                semi_aperture=float(a_b),
-                sensor_distance=float(d_b),
-                wavelength=shortest,
-                half_window=half_window,
-                displacement=float(s_b),
-            )
-            for a_b, d_b, s_b in zip(a, d, displacement, strict=True)
+    # lens by lens: a slow lens needs a smaller pupil and fewer points than the fastest of the batch
+    images = [
+        _aberrated(
+            opd[b], a=a[b], d=d[b], displacement=float(displacement[b]), grid=grid, pixel_pitch=pixel_pitch,
+            shape=shape, dtype=dtype,
         )
-        if count > sampling.MAX_PUPIL_SAMPLES:
-            raise ValueError(
-                f"this batch needs {count} pupil samples, more than {sampling.MAX_PUPIL_SAMPLES}: the largest blur "
-                f"reaches {float(displacement.max()) * 1e3:.3g} mm. Use smaller radii, vergences or shape."
-            )
-        per_pixel = sampling.points_per_pixel(
-            pixel_pitch=pixel_pitch, semi_aperture=float(widest.max()), sensor_distance=1.0, wavelength=shortest
+        for b in range(batch)
+    ]  # fmt: skip
+    return torch.stack(images)
+
+
+def _aberrated(
+    opd: Tensor,
+    *,
+    a: Tensor,
+    d: Tensor,
+    displacement: float,
+    grid: Tensor,
+    pixel_pitch: float,
+    shape: tuple[int, int],
+    dtype: torch.dtype,
+) -> Tensor:
+    """PSFs (Z, L, H, W) of one lens by matrix products; opd (1 or L, Z, T), displacement: of its rays [m]."""
+    device = opd.device
+    shortest = float(grid.min())
+    margin = max(shape) // 2 + sampling.WINDOW_MARGIN
+    count = sampling.pupil_samples(
+        semi_aperture=float(a.detach()),
+        sensor_distance=float(d.detach()),
+        wavelength=shortest,
+        half_window=margin * pixel_pitch,
+        displacement=displacement,
+    )
+    if count > sampling.MAX_PUPIL_SAMPLES:
+        raise ValueError(
+            f"this batch needs {count} pupil samples, more than {sampling.MAX_PUPIL_SAMPLES}: the largest blur "
+            f"reaches {displacement * 1e3:.3g} mm. Use smaller radii, vergences or shape."
         )
-    reach = math.ceil(per_pixel * (max(shape) // 2 + sampling.WINDOW_MARGIN))
-    step = pixel_pitch / per_pixel
+    per_pixel = sampling.points_per_pixel(
+        pixel_pitch=pixel_pitch,
+        semi_aperture=float(a.detach()),
+        sensor_distance=float(d.detach()),
+        wavelength=shortest,
+    )
+    reach, step = math.ceil(per_pixel * margin), pixel_pitch / per_pixel
     nodes = grid_nodes(count)
-    maps = torch.stack([m.expand(count, count) for m in zernikes(nodes[None, :].to(device), nodes[:, None].to(device))])
+    like = torch.empty(0, dtype=dtype, device=device)
     wavenumbers = (2 * math.pi / grid).to(device)
     weights = unfold_quadrant(disc_weights(count, spacing=grid_spacing(count))).to(device)
-    scales = (wavenumbers * (a / d)[:, None]).flatten()  # (B L,)
-    like = torch.empty(0, dtype=dtype, device=device)
+    scales = wavenumbers * (a / d)
     intensity = pupil_intensity(
-        (wavenumbers[:, None, None] * opd).flatten(0, 1).to(dtype),
-        maps=maps.to(dtype),
+        (wavenumbers[:, None, None] * opd).to(dtype),
+        maps=_pupil_maps(count, opd.shape[-1] - 1, dtype).to(device),
         amplitude=weights[None].to(dtype),
         field=None,
         scales=scales.to(dtype),
@@ -135,10 +151,24 @@ def batch_psf(
         step=step,
     )
     area = grid_spacing(count) ** 2 / float(weights.sum())
-    factor = area * (a[:, None] * pixel_pitch / (grid.to(device) * d[:, None])) ** 2  # (B, L)
+    factor = area * (a * pixel_pitch / (grid.to(device) * d)) ** 2  # (L,)
     rows, columns = (sampling.pixel_box(n, per_pixel=per_pixel, reach=reach).to(like) for n in shape)
-    images = (rows @ intensity @ columns.mT).unflatten(0, (batch, -1)) * factor[..., None, None, None].to(dtype)
-    return images.transpose(1, 2)
+    return ((rows @ intensity @ columns.mT) * factor[:, None, None, None].to(dtype)).transpose(0, 1)
+
+
+def _zernike_maps(nodes: Tensor, terms: int) -> Tensor:
+    """rho^2 and Noll's j = 1..terms on a grid of normalised nodes, (1 + terms, N, N)."""
+    one = torch.ones((), dtype=torch.float64)
+    pupil = Pupil(nodes[None, :], nodes[:, None], one, one, paraxial=True)
+    unit = torch.eye(terms, dtype=torch.float64)
+    maps = [pupil.rho2, *(zernike_sum(unit[j], pupil) for j in range(terms))]
+    return torch.stack([m.expand(len(nodes), len(nodes)) for m in maps])
+
+
+@functools.lru_cache(maxsize=8)  # 13 MB for 15 terms on 448 nodes
+@torch.inference_mode(False)
+def _pupil_maps(count: int, terms: int, dtype: torch.dtype) -> Tensor:
+    return _zernike_maps(grid_nodes(count), terms).to(dtype)
 
 
 def _radial_bank(
@@ -167,17 +197,13 @@ def _radial_bank(
         per_pixel = 2 ** max(3, math.ceil(math.log2(_PROFILE_STEPS * fastest / math.pi)))
         corner = math.sqrt(2) * (half + 0.5)
         nodes, arguments = _rounded((fastest * corner + defocus) / 2 + 32), _rounded(fastest * corner / _STEP + 8)
-    if nodes * arguments > _LARGEST_TABLE:
+    if max(nodes, arguments) > _MOST_FRINGES:
         raise ValueError(
-            f"this batch needs a Hankel table of {nodes} x {arguments}, more than {_LARGEST_TABLE} numbers: the PSF is "
-            "thousands of fringes wide. Use a smaller shape, larger f-numbers or distances nearer to the focus."
+            f"this batch needs {max(nodes, arguments)} samples of the pupil and the PSF, more than {_MOST_FRINGES}: it "
+            "has that many fringes. Use a smaller shape, larger f-numbers or distances nearer to the focus."
         )
-    rho, weights = (torch.as_tensor(value, device=residual.device) for value in legendre(nodes))
-    rho, weights = (rho + 1) / 2, weights / 2
-    phase = (wavenumbers[:, None] * residual.transpose(1, 2) * (a[:, None, None] ** 2 / 2))[..., None] * rho**2
-    amplitude = 2 * rho * weights  # (B, L, Z, n) below
-    field = torch.stack([phase.cos(), phase.sin()]) * amplitude
-    intensity = _hankel(field, rho, arguments).square().sum(0)  # (B, L, Z, T)
+    rim = wavenumbers[:, None] * residual.transpose(1, 2) * (a[:, None, None] ** 2 / 2)  # (B, L, Z)
+    intensity = _amplitude(rim, nodes=nodes, arguments=arguments).square().sum(0)  # (B, L, Z, T)
     steps = torch.arange(math.ceil(corner * per_pixel) + 3, dtype=torch.float64, device=residual.device)
     position = scales[..., None] * (steps * (pixel_pitch / per_pixel / _STEP))  # (B, L, R)
     low = torch.clamp(position.detach().floor().long(), max=arguments - 3)
@@ -201,22 +227,67 @@ def _rounded(count: float) -> int:
     return int(step * math.ceil(count / step))
 
 
-def _hankel(field: Tensor, rho: Tensor, arguments: int) -> Tensor:
-    """SUM field J0(t rho) at t = 0, _STEP, ...: (..., n) to (..., T). Small tables are kept, others made in parts."""
-    nodes = len(rho)
-    if nodes * arguments <= _KEPT_TABLE:
-        return field @ _bessel_table(nodes, arguments, field.device)
+def _amplitude(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
+    """U = 2 INT_0^1 exp(i w rho^2) J0(t rho) rho d rho at t = 0, _STEP, ...: w (...) [rad] at the rim to (2, ..., T).
 
-    def part(field: Tensor, first: int, last: int) -> Tensor:
-        t = torch.arange(first, last, dtype=torch.float64, device=field.device) * _STEP
-        return field @ torch.special.bessel_j0(rho[:, None] * t)
+    By Gauss-Legendre and a table of J0 that is kept, or, where that would be too large, through the projection.
+    """
+    if nodes * arguments > _KEPT_TABLE:
+        return _projected(rim, nodes=nodes, arguments=arguments)
+    rho, weights = (torch.as_tensor(value, device=rim.device) for value in legendre(nodes))
+    rho = (rho + 1) / 2
+    phase = rim[..., None] * rho**2
+    return torch.stack([phase.cos(), phase.sin()]) * (rho * weights) @ _bessel_table(nodes, arguments, rim.device)
 
-    step = max(1, _KEPT_TABLE // nodes)
-    ends = [(first, min(first + step, arguments)) for first in range(0, arguments, step)]
-    return torch.cat([checkpoint(part, field, *end, use_reentrant=False) for end in ends], dim=-1)
+
+def _projected(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
+    """The same by the projection-slice theorem: one FFT for each PSF, however many fringes it has.
+
+    U(t) = 1 / pi INT_-1^1 exp(i t x + i w x^2) 2 E(sqrt(1 - x^2)) dx,   E(Y) = INT_0^Y exp(i w y^2) dy, Fresnel's
+
+    The trapezium rule errs by the 1.5th power of its step, where the disc's projection ends like a root: 1e-6 here.
+    """
+    count = 2 ** math.ceil(math.log2(max(4 * nodes, 2 * arguments, 2**12) * 2 * math.pi / _STEP / 2))
+    step = 2 * math.pi / (_STEP * count)
+    half = math.floor(1 / step)
+    x = torch.arange(-half, half + 1, dtype=torch.float64, device=rim.device) * step
+    chord = torch.sqrt(torch.clamp(1 - x**2, min=0))
+    parts = []
+    for one in rim.flatten():  # one at a time: each takes megabytes
+        phase = one * x**2
+        wave = torch.complex(phase.cos(), phase.sin()) * _Fresnel.apply(one, chord)
+        padded = torch.nn.functional.pad(wave, (0, count - len(x)))
+        # the origin of x stands at place `half`: a shift by it is a phase
+        shift = torch.arange(arguments, dtype=torch.float64, device=rim.device) * (2 * math.pi * half / count)
+        spectrum = torch.fft.ifft(padded)[:arguments] * torch.complex(shift.cos(), -shift.sin())
+        parts.append(spectrum * (2 * step * count / math.pi))
+    return torch.view_as_real(torch.stack(parts)).movedim(-1, 0).unflatten(1, rim.shape)
+
+
+class _Fresnel(torch.autograd.Function):
+    """E(w, Y) = INT_0^Y exp(i w y^2) dy, with its derivative (Y exp(i w Y^2) - E) / 2 w to w."""
+
+    @staticmethod
+    def forward(ctx, rim, chord):
+        scale = math.sqrt(2 * max(abs(float(rim)), 1e-12) / math.pi)
+        sine, cosine = (torch.as_tensor(part, device=chord.device) for part in fresnel(chord.cpu().numpy() * scale))
+        result = torch.complex(cosine, sine if rim > 0 else -sine) / scale
+        ctx.save_for_backward(rim, chord, result)
+        return result
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        rim, chord, result = ctx.saved_tensors
+        phase = rim * chord**2
+        slope = torch.complex(torch.zeros_like(chord), chord**3 / 3)  # its limit in focus
+        if abs(float(rim)) > 1e-4:
+            slope = (chord * torch.complex(phase.cos(), phase.sin()) - result) / (2 * rim)
+        return (grad.conj() * slope).real.sum(), None
 
 
 @functools.lru_cache(maxsize=12)
+@torch.inference_mode(False)  # what is kept must serve training too
 def _bessel_table(nodes: int, arguments: int, device: torch.device) -> Tensor:
     """J0(t rho), (n, T)."""
     rho = torch.as_tensor(legendre(nodes)[0], device=device) / 2 + 0.5
@@ -235,6 +306,7 @@ def _cubic(offset):
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
 def _ring_shares(half: int, per_pixel: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Integral over each pixel (far, near), 0 <= near <= far <= half, of a radial function, cubic between steps.
 

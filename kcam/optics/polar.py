@@ -137,6 +137,7 @@ def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: fl
 
 
 @functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
 def _lattice(reach: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Distinct squared radii of the grid points in one quadrant, and where each point finds its own."""
     squares = torch.arange(reach + 1, device=device) ** 2

@@ -117,6 +117,7 @@ def _kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.nd
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
 def disc_coverage(cells: int, *, half_width: float, radius: float = 1.0) -> Tensor:
     """Share of each cell of a square grid that lies inside a centred disc, (cells, cells) float64, exact.
 
@@ -159,6 +160,7 @@ def edge_response(frequency: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     """Quadrature weights of a disc on one quadrant of a grid: high order, although the rim cuts through cells.
 
@@ -326,6 +328,7 @@ def map_onto(field: Tensor, weights: Onto) -> Tensor:
 
 
 @functools.lru_cache(maxsize=6)
+@torch.inference_mode(False)
 def map_weights(
     pixels: int, *, half_width: float, count: int, spacing: float, dtype: torch.dtype, device: torch.device
 ) -> MapWeights:

@@ -37,6 +37,7 @@ class Warp:
 
     @staticmethod
     @functools.lru_cache(maxsize=4)
+    @torch.inference_mode(False)
     def build(
         count: int, *, spacing: float, tau: float, corner: float, dtype: torch.dtype, device: torch.device
     ) -> Warp | None:

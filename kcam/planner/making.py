@@ -56,7 +56,7 @@ def make_plan(
     Raises:    ValueError for a tolerance or a memory out of range, or no scenes; TypeError for other things than
                scenes.
     """
-    _check_tolerance(tolerance)
+    check_tolerance(tolerance)
     return Planner(camera, scenes, max_memory=max_memory).plan(tolerance)
 
 
@@ -82,7 +82,7 @@ class Planner:
     def plan(self, tolerance: float | str) -> Plan:
         """The plan for a tolerance."""
         start = time.perf_counter()
-        _check_tolerance(tolerance)
+        check_tolerance(tolerance)
         rows = _Rows(self.prices)
         skipped: list[int] = []
         allowed = 0.0
@@ -176,7 +176,8 @@ def _check_scenes(scenes: Sequence[Any], max_memory: float | None) -> None:
         raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory:g}.")
 
 
-def _check_tolerance(tolerance: Any) -> None:
+def check_tolerance(tolerance: Any) -> None:
+    """ValueError for what is no tolerance of a plan."""
     if isinstance(tolerance, str) and tolerance != SENSOR:
         raise ValueError(f'unknown tolerance "{tolerance}": expected a number such as 0.01, or "{SENSOR}".')
     number = isinstance(tolerance, (int, float)) and not isinstance(tolerance, bool)

@@ -118,16 +118,21 @@ def test_gradients_of_the_hankel_form() -> None:
     assert torch.autograd.gradcheck(total, inputs, eps=1e-6, atol=1e-4, rtol=3e-4)
 
 
-def test_a_table_too_large_to_keep_is_made_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    vergences = torch.tensor([3.0], dtype=torch.float64, requires_grad=True)
-    lenses = {"radii": torch.tensor([2.0]) * mm, "wavelengths": WAVELENGTHS, "sensor_distance": 20 * mm}
-    lenses |= {"pixel_pitch": 4 * um, "shape": (31, 31), "dtype": torch.float64}
-    whole = optics.batch_psf(vergences, **lenses)
-    monkeypatch.setattr(batch, "_KEPT_TABLE", 5000)
-    parts = optics.batch_psf(vergences, **lenses)
-    assert torch.allclose(parts, whole, atol=1e-15)
-    gradients = [torch.autograd.grad(psf.square().sum(), vergences)[0] for psf in (whole, parts)]
-    assert torch.allclose(*gradients, rtol=1e-9)
+@pytest.mark.parametrize("rim", [0.0, 0.3, 40.0, -300.0, 2500.0])
+def test_the_projection_gives_what_the_table_of_j0_gives(rim: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Amplitudes and their slope to the defocus; the trapezium rule's 1e-6 where the disc's projection ends."""
+    nodes, arguments = 64 + int(abs(rim)) * 2, 1024
+    found = []
+    for kept in (2**30, 0):
+        monkeypatch.setattr(batch, "_KEPT_TABLE", kept)
+        defocus = torch.tensor([[rim]], dtype=torch.float64, requires_grad=True)
+        amplitude = batch._amplitude(defocus, nodes=nodes, arguments=arguments)
+        weight = torch.linspace(1, 2, arguments, dtype=torch.float64)
+        found.append((amplitude.detach(), torch.autograd.grad((amplitude * weight).sum(), defocus)[0]))
+    (table, table_slope), (projected, projected_slope) = found
+    assert table.shape == (2, 1, 1, arguments)
+    assert (table - projected).abs().max() < 1e-6
+    assert torch.allclose(table_slope, projected_slope, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("aberrated", [False, True])
@@ -163,7 +168,7 @@ def test_an_empty_batch_gives_an_empty_bank() -> None:
         ({"coefficients": torch.zeros(3, 4)}, r"coefficients must be \(B, K\) with B = 1"),
         ({"pixel_pitch": 4.0}, r"did you mean 4 \* um"),
         ({"vergences": torch.zeros(1, 1, 3)}, r"vergences must be \(B,\), \(B, Z\) or \(B, Z, 2\)"),
-        ({"vergences": torch.tensor([5e5])}, "needs a Hankel table of .* more than"),
+        ({"vergences": torch.tensor([5e5])}, "needs .* samples of the pupil and the PSF, more than"),
         (
             {"radii": torch.tensor([0.1]), "sensor_distance": 0.01, "coefficients": torch.zeros(1, 4)},
             "needs .* pupil samples, more than",
@@ -175,3 +180,27 @@ def test_bad_input(change: dict, message: str) -> None:
     given |= {"sensor_distance": SENSOR, "pixel_pitch": 4 * um, "shape": (301, 301)} | change
     with pytest.raises(ValueError, match=message):
         optics.batch_psf(given.pop("vergences"), **given)
+
+
+@pytest.mark.parametrize("aberrated", [False, True])
+def test_a_first_call_in_inference_mode_does_not_spoil_training(aberrated: bool) -> None:
+    """Tables that are kept would be inference tensors, which autograd refuses."""
+
+    def bank(radii: torch.Tensor) -> torch.Tensor:
+        return optics.batch_psf(
+            torch.tensor([0.37]),
+            radii=radii,
+            coefficients=torch.full((1, 5), 20e-9) if aberrated else None,
+            wavelengths=WAVELENGTHS,
+            sensor_distance=SENSOR,
+            pixel_pitch=3.7 * um,  # no other test's tables
+            shape=(23, 23),
+            dtype=torch.float64,
+        )
+
+    radii = torch.tensor([1.37 * mm], dtype=torch.float64, requires_grad=True)
+    with torch.inference_mode():
+        bank(radii)
+    gradient = torch.autograd.grad(bank(radii).amax(), radii)[0]
+    assert bool(gradient.isfinite().all())
+    assert float(gradient.abs()) > 0

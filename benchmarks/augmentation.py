@@ -1,0 +1,447 @@
+"""Camera augmentations beside Kornia's nearest ones, the straightforward way, and their own bare maths.
+
+    python -m benchmarks.augmentation [--quick] [--only NAME] [--out benchmarks/results/augmentation.json]
+
+All contestants of a race run by turns in one process. *Ours* is the augmentation as it is called, *simulate* its
+effect alone on drawn numbers, *light* the way of a whole picture into linear light and back, *identity* a Kornia
+augmentation that returns its input. The maths is simulate, and light where the effect wants it; the straightforward way
+needs both too. What we add is ours - identity - maths: drawing, picking rows, checks, copies. The claim: it costs
+less than the maths; what comes out where light does not count as maths is written down too.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import kornia.augmentation as K
+import torch
+from kornia.color import CFA, raw_to_rgb, rgb_to_raw
+from kornia.geometry.calibration import undistort_points
+from kornia.geometry.transform import remap
+from rich.console import Console
+from torch import Tensor, nn
+
+import kcam.augmentation as KC
+from benchmarks.common import Contestant, environment, race, write_json
+from kcam import Camera, Scene, isp, measure, optics, sensor
+from kcam.augmentation.base import is_picture, to_light, wavelengths_of
+from kcam.augmentation.isp import planck_ratio
+from kcam.context import Context
+from kcam.isp import tone_curve
+from kcam.units import wavelength_grid
+
+RESULTS = Path(__file__).parent / "results" / "augmentation.json"
+SEED = 3  # draws four of eight rows at p = 0.5
+BATCH, SIDE, CHANNELS = 8, 256, (3, 28)
+
+Plain = Callable[[Any, Tensor, dict[str, Tensor]], Tensor]
+Make = Callable[[float], nn.Module]
+
+
+Plain = Callable[[Any, Tensor, dict[str, Tensor]], Tensor]
+Make = Callable[[float], Any]
+
+
+class Identity(K.IntensityAugmentationBase2D):
+    """What Kornia's machinery costs by itself."""
+
+    def apply_transform(self, input: Tensor, params: Any, flags: Any, transform: Tensor | None = None) -> Tensor:
+        """The input."""
+        return input
+
+
+class KorniaBayer(K.IntensityAugmentationBase2D):
+    """Kornia's mosaic and its bilinear demosaic."""
+
+    def apply_transform(self, input: Tensor, params: Any, flags: Any, transform: Tensor | None = None) -> Tensor:
+        """Of the coded picture."""
+        return raw_to_rgb(rgb_to_raw(input, CFA.BG), CFA.BG)
+
+
+# ---- the straightforward ways --------------------------------------------------------------------------------------
+
+
+class Dispersion(optics.Element):
+    """A vergence of its own at each wavelength."""
+
+    symmetric, focuses = True, False
+
+    def __init__(self, vergences: Tensor) -> None:
+        super().__init__()
+        self.vergences = vergences
+
+    def vergence(self, wavelengths: Tensor) -> Tensor:
+        """Given for the wavelengths that will be asked for."""
+        return self.vergences
+
+
+def lens_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """A Lens and an Imaging for each sample."""
+    wavelengths = wavelengths_of(signal, augmentation.wavelengths)
+    window = augmentation.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
+    rows = []
+    for index in range(len(signal)):
+        own = {name: value[index : index + 1] for name, value in drawn.items()}
+        row = signal[index : index + 1]
+        focal = float(own.get("focal_length", getattr(augmentation, "focal_length", torch.nan)))
+        elements = [optics.CircularAperture(focal / float(own["f_number"])), optics.ThinLens(focal)]
+        if "rms" in own:
+            elements.append(optics.ZernikeAberration(augmentation.coefficients(own)[0]))
+        if "axial" in own:
+            elements.append(Dispersion(augmentation.vergences(own, wavelengths)[0, 0]))
+            row = magnified(row, 1 + float(own["lateral"]) * augmentation.dispersion(wavelengths)[1])
+        imaging = optics.Imaging(
+            optics.Lens(*elements, focus_distance=float(own.get("focus", torch.inf))),
+            pixel_pitch=augmentation.pixel_pitch,
+            propagator="fresnel",
+            psf_shape=window,
+            renormalise=True,
+            distance=float(own.get("distance", torch.inf)),
+        )
+        rows.append(imaging(row, Context(wavelengths=wavelengths)))
+    return torch.cat(rows)
+
+
+def magnified(row: Tensor, scales: Tensor) -> Tensor:
+    """Channel by channel."""
+    channels = []
+    for channel, scale in zip(row.split(1, dim=1), scales.tolist(), strict=True):
+        matrix = torch.tensor([[[1 / scale, 0.0, 0.0], [0.0, 1 / scale, 0.0]]], dtype=row.dtype)
+        grid = nn.functional.affine_grid(matrix, list(channel.shape), align_corners=False)
+        channels.append(nn.functional.grid_sample(channel, grid, padding_mode="reflection", align_corners=False))
+    return torch.cat(channels, dim=1)
+
+
+def vignette_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """A map for each sample."""
+    height, width = signal.shape[-2:]
+    y, x = torch.meshgrid(*(torch.arange(n) - (n - 1) / 2 for n in (height, width)), indexing="ij")
+    u = torch.hypot(x, y) / torch.hypot(x, y).max()
+    rows = []
+    for row, field, shade in zip(signal, drawn["field"].tolist(), drawn["shade"].tolist(), strict=True):
+        theta = torch.atan(u * torch.tan(torch.deg2rad(torch.tensor(field)) / 2))
+        rows.append(row * torch.cos(theta) ** 4 * (1 - shade * u**2))
+    return torch.stack(rows)
+
+
+def distort_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """Kornia's inverse of the distortion in 40 steps, and its remap."""
+    height, width = signal.shape[-2:]
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    points = torch.stack([x, y], dim=-1).reshape(1, -1, 2).to(signal)
+    focal = float(max(height, width))
+    camera = torch.tensor([[[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]]).to(signal)
+    rows = []
+    for index in range(len(signal)):
+        coefficients = torch.stack([drawn[name][index : index + 1] for name in ("k1", "k2", "p1", "p2")], dim=1)
+        source = undistort_points(points, camera, coefficients.to(signal), num_iters=40).view(1, height, width, 2)
+        rows.append(remap(signal[index : index + 1], source[..., 0], source[..., 1], align_corners=True))
+    return torch.cat(rows)
+
+
+def bayer_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """A mosaic and a demosaic for each sample; for a cube a camera."""
+    rows = []
+    for index, choice in enumerate(drawn["pattern"].tolist()):
+        row, pattern = signal[index : index + 1], augmentation.patterns[choice]
+        if is_picture(signal):
+            rows.append(isp.demosaic(sensor.mosaic(row, pattern=pattern), pattern=pattern))
+        else:
+            camera = Camera(
+                sensor.ColourFilter.kodak(), sensor.Mosaic(pattern), sensor.Exposure(), isp.Demosaic(),
+                isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve(),
+                context=Context(wavelengths=wavelength_grid(count=signal.shape[1])),
+            )  # fmt: skip
+            rows.append(camera(row))
+    return torch.cat(rows)
+
+
+def noise_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """torch.poisson and torch.randn of all samples at once, from the global generator: no replay."""
+    gain, well, sigma = (drawn[name].to(signal)[:, None, None, None] for name in ("iso", "full_well", "read_noise"))
+    scale = well / (gain / 100)
+    counts = torch.poisson(signal.clamp(min=0) * scale)
+    return ((counts + sigma * torch.randn_like(signal)) / scale).clamp(max=1)
+
+
+def pattern_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """torch.randn twice, of all samples at once."""
+    prnu, dsnu = (drawn[name].to(signal)[:, None, None, None] for name in ("prnu", "dsnu"))
+    gain = 1 + prnu * torch.randn_like(signal)
+    return signal * gain + dsnu / augmentation.full_well * torch.randn_like(signal)
+
+
+def exposure_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """A gain and a clamp for each sample."""
+    return torch.stack([(row * 2**stop).clamp(0, 1) for row, stop in zip(signal, drawn["stops"].tolist(), strict=True)])
+
+
+def quantise_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """Rounded to each sample's steps."""
+    steps = (2 ** (augmentation.fewest + drawn["bits"]) - 1).tolist()
+    return torch.stack([(row * step).round() / step for row, step in zip(signal.clamp(0, 1), steps, strict=True)])
+
+
+def balance_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """A gain for each channel of each sample."""
+    wavelengths, rows = wavelengths_of(signal, augmentation.wavelengths), []
+    for index, row in enumerate(signal):
+        gains = planck_ratio(wavelengths, temperature=drawn["temperature"][index : index + 1])[0]
+        if len(row) == 3:
+            gains[1] *= 2 ** drawn["tint"][index]
+        rows.append(row * gains.to(row)[:, None, None])
+    return torch.stack(rows)
+
+
+def matrix_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """One einsum."""
+    return torch.einsum("bij,bjhw->bihw", augmentation.matrix(drawn).to(signal), signal)
+
+
+def tone_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """The two curves for each sample."""
+    rows = []
+    for row, gamma, contrast in zip(signal, drawn["gamma"].tolist(), drawn["contrast"].tolist(), strict=True):
+        u = ((row.clamp(0, 1) + 0.01) ** gamma - 0.01**gamma) / (1.01**gamma - 0.01**gamma)
+        rows.append(u + 2 * contrast * u * (1 - u) * (2 * u - 1))
+    return torch.stack(rows)
+
+
+def camera_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """The preset phone without a plan, built for each sample."""
+    rows = []
+    for index, distance in enumerate(drawn["distance"].tolist()):
+        row = signal[index : index + 1]
+        if is_picture(row):
+            scene = Scene.from_rgb(row, depth=distance)
+        else:
+            scene = Scene.from_bands(row, wavelengths=wavelength_grid(count=row.shape[1]), depth=distance)
+        rows.append(Camera.phone()(scene))
+    return torch.cat(rows)
+
+
+# ---- what is compared ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """One augmentation, the straightforward way to write it, and its nearest relatives in Kornia.
+
+    exact: plain computes the same from the same drawn numbers. share: of the batch that plain is run on. only: the
+    channels that it takes.
+    """
+
+    augmentation: Callable[..., Any]
+    plain: Plain
+    relatives: dict[str, Make]
+    exact: bool = True
+    share: float = 1.0
+    only: tuple[int, ...] = CHANNELS
+    relative_only: tuple[int, ...] = CHANNELS
+
+
+def blur(p: float) -> nn.Module:
+    """In the window that RandomDefocus takes for its PSFs on pictures, 57 x 57; its time does not depend on sigma."""
+    return K.RandomGaussianBlur((57, 57), (1.0, 9.0), p=p)
+
+
+def bayer(p: float) -> nn.Module:
+    """Kornia's mosaic and bilinear demosaic as an augmentation."""
+    return KorniaBayer(p=p)
+
+
+def fisheye(p: float) -> nn.Module:
+    """Of about the same displacement."""
+    return K.RandomFisheye(torch.tensor([-0.1, 0.1]), torch.tensor([-0.1, 0.1]), torch.tensor([0.9, 1.1]), p=p)
+
+
+GAUSSIAN: dict[str, Make] = {"RandomGaussianBlur": blur}
+MOTION: dict[str, Make] = {"RandomMotionBlur": lambda p: K.RandomMotionBlur((21, 35), 35.0, 0.5, p=p)}
+NOISE: dict[str, Make] = {"RandomGaussianNoise": lambda p: K.RandomGaussianNoise(p=p)}
+CASES: dict[str, Case] = {
+    "RandomDefocus": Case(KC.RandomDefocus, lens_per_sample, GAUSSIAN | MOTION),
+    "RandomDiffraction": Case(KC.RandomDiffraction, lens_per_sample, GAUSSIAN),
+    "RandomAberration": Case(KC.RandomAberration, lens_per_sample, GAUSSIAN | MOTION),
+    "RandomChromaticAberration": Case(KC.RandomChromaticAberration, lens_per_sample, GAUSSIAN),
+    "RandomVignetting": Case(
+        KC.RandomVignetting,
+        vignette_per_sample,
+        {"RandomLinearIllumination": lambda p: K.RandomLinearIllumination(p=p)},
+    ),
+    "RandomLensDistortion": Case(KC.RandomLensDistortion, distort_per_sample, {"RandomFisheye": fisheye}),
+    "RandomBayer": Case(KC.RandomBayer, bayer_per_sample, {"rgb_to_raw, raw_to_rgb": bayer}, relative_only=(3,)),
+    "RandomShotReadNoise": Case(KC.RandomShotReadNoise, noise_of_the_batch, NOISE, exact=False),
+    "RandomFixedPattern": Case(KC.RandomFixedPattern, pattern_of_the_batch, NOISE, exact=False),
+    "RandomExposure": Case(
+        KC.RandomExposure, exposure_per_sample, {"RandomBrightness": lambda p: K.RandomBrightness((0.5, 1.5), p=p)}
+    ),
+    "RandomQuantisation": Case(
+        KC.RandomQuantisation, quantise_per_sample, {"RandomPosterize": lambda p: K.RandomPosterize((3.0, 8.0), p=p)}
+    ),
+    "RandomWhiteBalance": Case(
+        KC.RandomWhiteBalance,
+        balance_per_sample,
+        {"RandomPlanckianJitter": lambda p: K.RandomPlanckianJitter(p=p)},
+        relative_only=(3,),
+    ),
+    "RandomColourMatrix": Case(
+        KC.RandomColourMatrix,
+        matrix_of_the_batch,
+        {"ColorJiggle": lambda p: K.ColorJiggle(0.2, 0.2, 0.2, 0.05, p=p)},
+        only=(3,),
+    ),
+    "RandomToneCurve": Case(
+        KC.RandomToneCurve, tone_per_sample, {"RandomGamma": lambda p: K.RandomGamma((0.7, 1.4), p=p)}
+    ),
+    "RandomCamera": Case(KC.RandomCamera, camera_per_sample, {}, exact=False, share=1 / BATCH),
+}
+
+
+def half_of_the_rows(batch: int) -> int:
+    """A seed of the global generator for which half of the rows are drawn at p = 0.5: Kornia's gate comes first."""
+    for seed in range(1000):
+        torch.manual_seed(seed)
+        if int(Identity(p=0.5).forward_parameters(torch.Size((batch, 3, 4, 4)))["batch_prob"].sum()) == batch // 2:
+            return seed
+    raise RuntimeError("no seed in 1000 draws half of the rows.")
+
+
+def simulate(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """The effect alone."""
+    if isinstance(augmentation, KC.RandomLensDistortion):
+        return augmentation._remapped(signal, drawn, augmentation.flags, inverse=False)
+    return augmentation.simulate(signal, drawn)
+
+
+def compare(name: str, case: Case, *, channels: int, batch: int, side: int, seconds: float) -> dict[str, Any]:
+    """One line of the table: seconds of each contestant, and what we add at p = 1 and p = 0.5."""
+    picture = torch.rand(batch, channels, side, side, generator=torch.Generator().manual_seed(1))
+    seed = half_of_the_rows(batch)
+
+    def seeded(call: Callable[[Tensor], Any]) -> Callable[[], Any]:
+        def run() -> Any:
+            torch.manual_seed(seed)
+            return call(picture)
+
+        return run
+
+    contestants: list[Contestant] = []
+    for p in (1.0, 0.5):
+        own = case.augmentation(p=p)
+        if p < 1 and changes_channels(own, channels):
+            continue
+        torch.manual_seed(seed)
+        params = own.forward_parameters(picture.shape)
+        rows = (params["batch_prob"] > 0.5).nonzero().flatten()
+        drawn = {key: params[key][rows] for key in own._param_generator.draws}
+        coded = getattr(own, "in_light", False) and is_picture(picture)
+        light = (to_light(picture) if coded else picture)[rows]
+        if p == 1:
+            contestants.append(
+                straightforward(case, own, picture, drawn, coded=coded, truth=own(picture, params=params))
+            )
+            if channels in case.relative_only:
+                contestants += [Contestant(who, seeded(make(p)), no_error) for who, make in case.relatives.items()]
+            if coded:
+                contestants.append(Contestant("light", lambda: tone_curve(to_light(picture)), no_error))
+        contestants += [
+            Contestant(f"kcam {p:g}", seeded(own), no_error, default=p == 1),
+            Contestant(f"kcam simulate {p:g}", lambda a=own, s=light, d=drawn: simulate(a, s, d), no_error),
+            Contestant(f"identity {p:g}", seeded(Identity(p=p)), no_error),
+        ]
+    size = f"{batch} x {channels} x {side}^2"
+    with torch.no_grad():
+        slow = measure.cpu_time(next(c.call for c in contestants if c.default)) > 3
+        results = race(name, size=size, direction="forward", contestants=contestants, seconds=0 if slow else seconds)
+    taken = {result["who"]: result for result in results}
+    return {
+        "augmentation": name,
+        "size": size,
+        "channels": channels,
+        "relatives": [who for who in case.relatives if who in taken],
+        "straightforward": case.plain.__doc__,
+        "seconds": {who: result["seconds"] for who, result in taken.items()},
+        "seconds_iqr": {who: result["seconds_iqr"] for who, result in taken.items()},
+        "share_timed": {who: result["share_timed"] for who, result in taken.items() if result["share_timed"] < 1},
+        "peak_memory": taken["kcam 1"]["peak_memory"],
+        "first_call": taken["kcam 1"]["first_call"],
+        "rounds": taken["kcam 1"]["rounds"],
+        "difference": taken["straightforward"]["error"].get("largest difference"),
+        "added": {f"{p:g}": added(taken, p) for p in (1.0, 0.5) if f"kcam {p:g}" in taken},
+    }
+
+
+def straightforward(
+    case: Case, own: Any, picture: Tensor, drawn: dict[str, Tensor], *, coded: bool, truth: Tensor
+) -> Contestant:
+    """The plain way on the rows that it is run on, with its largest difference from our result."""
+    few = max(1, round(case.share * len(picture)))
+
+    def call() -> Tensor:
+        light = to_light(picture[:few]) if coded else picture[:few]
+        result = case.plain(own, light, {key: value[:few] for key, value in drawn.items()})
+        return tone_curve(result) if coded else result
+
+    def difference(result: Tensor) -> dict[str, float]:
+        return {"largest difference": float((result - truth).abs().max())} if case.exact else {}
+
+    return Contestant("straightforward", call, difference, share=few / len(picture))
+
+
+def no_error(result: Tensor) -> dict[str, float]:
+    """Kornia's relatives compute something else, and our own parts are checked in the tests."""
+    return {}
+
+
+def changes_channels(augmentation: Any, channels: int) -> bool:
+    """Whether it must have p = 1."""
+    known = getattr(augmentation, "output_channels", None)
+    return known is not None and known(channels) != channels
+
+
+def added(taken: dict[str, dict[str, Any]], p: float) -> dict[str, Any]:
+    """What stands between our augmentation and an identity of Kornia's plus the maths, beside the maths."""
+    whole, effect, nothing = (taken[f"{who} {p:g}"]["seconds"] for who in ("kcam", "kcam simulate", "identity"))
+    light = p * taken["light"]["seconds"] if "light" in taken else 0.0  # at p = 0.5 half of the rows are drawn
+    extra = whole - nothing - effect - light
+    return {
+        "seconds": extra,
+        "maths": effect + light,
+        "share_of_maths": extra / (effect + light),
+        "met": extra < effect + light,
+        "met_without_light": extra + light < effect,
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the races, print them, and write them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny pictures, for the tests")
+    parser.add_argument("--only", help="augmentations whose name contains this; nothing is written")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    sizes: dict[str, Any] = {"batch": BATCH, "side": SIDE, "seconds": 4.0}
+    if options.quick:
+        sizes = {"batch": 2, "side": 32, "seconds": 0.0}
+    console, lines = Console(), []
+    with measure.one_thread(), torch.random.fork_rng():
+        for channels in CHANNELS:
+            for name, case in CASES.items():
+                if channels not in case.only or (options.only and options.only not in name):
+                    continue
+                line = compare(name, case, channels=channels, **sizes)
+                lines.append(line)
+                times = ", ".join(f"{who} {1e3 * t:.1f}" for who, t in line["seconds"].items())
+                shares = ", ".join(f"p={p}: {found['share_of_maths']:.2f}" for p, found in line["added"].items())
+                console.print(f"[bold]{line['augmentation']}[/] {line['size']}: ms: {times}; we add {shares}")
+    if not options.only:
+        write_json(options.out, {"environment": environment(), "lines": lines})
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
