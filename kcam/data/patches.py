@@ -165,11 +165,12 @@ def group_of(name: str, facts: dict[str, Any], pattern: str | None) -> str:
     return str(facts.get("group", name))
 
 
-def make_plan(cubes: Path, settings: Settings) -> StorePlan:
+def make_plan(cubes: str | os.PathLike[str], settings: Settings) -> StorePlan:
     """Plan a store from a folder of cube files, from their headers alone.
 
     Raises:    StoreError where there is no cube to read.
     """
+    cubes = Path(cubes)
     paths = sorted(cubes.glob(f"*{SUFFIX}")) if cubes.is_dir() else [cubes]
     paths = [path for path in paths if not path.name.startswith(".")]
     if not paths:
@@ -346,7 +347,7 @@ class Outcome:
 
 def extract(
     plan: StorePlan,
-    out: Path,
+    out: str | os.PathLike[str],
     *,
     workers: int = 1,
     resume: bool = False,
@@ -361,6 +362,7 @@ def extract(
                submit: of an executor with futures of its own, such as that of a `dask.distributed.Client`.
     Raises:    StoreError for a folder that holds something else, a store of another plan, or too small a disk.
     """
+    out = Path(out)
     outcome = Outcome(failed=dict(plan.failed))
     work = out / WORK
     finished = _finished(out)
@@ -649,12 +651,13 @@ def scene_array(folder: Path, document: dict[str, Any], record: dict[str, Any]) 
     return found
 
 
-def verify(store: Path) -> list[str]:
+def verify(store: str | os.PathLike[str]) -> list[str]:
     """What is wrong with a store, or with one split of it, a line each; nothing where all files are as written.
 
     Every file against its sha256, none missing and none too many (but run logs, *.log), all splits there and of one
     plan, every group of scenes in the split that its name's hash says and in no other.
     """
+    store = Path(store)
     one = (store / MANIFEST).is_file()
     folders = [store] if one else sorted(path.parent for path in store.glob(f"*/{MANIFEST}"))
     problems = []
