@@ -141,16 +141,20 @@ def forget(folder: Path) -> bool:
     return True
 
 
-def rate(folder: Path, name: str, order: np.ndarray) -> float:
-    """Patches per second, opening included, as a training that has just begun would see them."""
+def close(opened: dict[str, tuple[Reader, Any]]) -> None:
+    """Close what is open, and let go of what is mapped."""
+    for _, handle in opened.values():
+        if hasattr(handle, "close"):
+            handle.close()
+    opened.clear()
+
+
+def rate(read: Reader, order: np.ndarray) -> float:
+    """Patches per second."""
     start = time.perf_counter()
-    read, handle = STORES[name](folder)
     for index in order:
         read(int(index))
-    seconds = time.perf_counter() - start
-    if hasattr(handle, "close"):
-        handle.close()
-    return len(order) / seconds
+    return len(order) / (time.perf_counter() - start)
 
 
 def reading(folder: Path, size: Size) -> list[dict[str, Any]]:
@@ -159,24 +163,29 @@ def reading(folder: Path, size: Size) -> list[dict[str, Any]]:
     names = [name for name in STORES if name not in skipped]
     count = len(PatchDataset(folder / "store" / "train"))
     draw = np.random.default_rng(0)
-    same = [STORES[name](folder)[0](1) for name in names]
+    opened = {name: STORES[name](folder) for name in names}
+    same = [read(1) for read, _ in opened.values()]
+    close(opened)
     same = [values / values.max() for values in same]
     if not all(torch.allclose(values, same[0], atol=1e-6) for values in same):
         raise RuntimeError("the stores hold different patches.")
     del same
     found: dict[tuple[str, str], list[float]] = {}
-    for state in ("warm", "cold"):
-        if state == "cold" and not forget(folder):
-            continue
-        for _ in range(size.rounds + (state == "warm")):
-            order = draw.permutation(count)[: size.draws]
-            for name in names:
-                if state == "cold":
-                    forget(folder)
-                found.setdefault((name, state), []).append(rate(folder, name, order))
-        if state == "warm":
-            for rates in found.values():
-                rates.pop(0)  # read from the disk, to be warm
+    opened = {name: STORES[name](folder) for name in names}  # kept open, as through a training
+    for name in names:
+        rate(opened[name][0], np.arange(count))
+    for _ in range(size.rounds):
+        order = draw.permutation(count)[: size.draws]
+        for name in names:
+            found.setdefault((name, "warm"), []).append(rate(opened[name][0], order))
+    close(opened)
+    for _ in range(size.rounds if forget(folder) else 0):
+        order = draw.permutation(count)[: size.draws]
+        for name in names:
+            forget(folder)
+            opened = {name: STORES[name](folder)}  # what is mapped is not forgotten
+            found.setdefault((name, "cold"), []).append(rate(opened[name][0], order))
+            close(opened)
     return [
         {"store": name, "state": state} | spread(rates, found["kcam store", state], "patches_per_second")
         for (name, state), rates in found.items()
