@@ -20,12 +20,12 @@ from kcam.data.patches import Settings, _brightest, _strips
 from kcam.units import nm
 
 SCRIPT = """
-import json, resource, sys
+import json, re, sys
 from pathlib import Path
 from kcam.data.patches import Settings, _brightest, extract, make_plan, open_cube
 
-def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+def peak():  # getrusage would count what the parent held when it started this process
+    return 1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
 
 start = peak()
 cubes, out = map(Path, sys.argv[1:])
