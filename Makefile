@@ -1,4 +1,4 @@
-# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | check | wheel-test | clean.   All is installed into .venv, once.
+# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
 PYTHON ?= python3
 VENV ?= .venv
 PEERS ?= .venv-peers
@@ -10,7 +10,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation lint types check wheel-test clean
+.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-data lint types check wheel-test clean
 
 help:
 	@head -1 Makefile
@@ -64,6 +64,11 @@ $(PEERS)/peers.stamp: pyproject.toml constraints.txt benchmarks/peers.txt
 
 bench-peers: $(PEERS)/peers.stamp
 	OMP_NUM_THREADS=1 $(PEERS)/bin/python -m benchmarks.peers
+
+# Zarr is there to be compared with, and for export; nothing else needs it.
+bench-data: $(VENV)/dev.stamp
+	$(PIP) --editable '.[zarr]' || echo "zarr does not install here and is skipped"
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.patches
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

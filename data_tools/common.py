@@ -7,13 +7,13 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-ALL_DONE, SOME_FAILED, USAGE = 0, 1, 2
+ALL_DONE, SOME_FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 err = Console(stderr=True)
 
 Json = Annotated[bool, typer.Option("--json", help="print the result as JSON, for scripts")]
@@ -52,7 +52,12 @@ def end(result: dict[str, Any], lines: list[str], *, as_json: bool, failed: dict
     raise typer.Exit(SOME_FAILED if failed else ALL_DONE)
 
 
-def usage(message: str) -> None:
+def usage(message: str) -> NoReturn:
     """One line, and the exit status of a wrong call."""
+    stop(message, USAGE)
+
+
+def stop(message: str, status: int) -> NoReturn:
+    """One line, and an exit status."""
     typer.echo(f"{Path(sys.argv[0]).name}: {message}", err=True)
-    raise typer.Exit(USAGE)
+    raise typer.Exit(status)

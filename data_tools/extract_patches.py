@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from common import Json, Workers, end, progress, usage
+from common import INTERRUPTED, SOME_FAILED, Json, Workers, end, progress, stop, usage
 
-from kcam.data.patches import Settings, StoreError, extract, make_plan, parse_split
+from kcam.data.patches import Settings, StoreError, StoreStopped, extract, make_plan, parse_split
 
 RATE = 100e6  # bytes of patches per second and worker, roughly: for the estimate of --dry-run
 
@@ -71,16 +72,17 @@ def main(
             if scheduler is None:
                 outcome = extract(plan, out, workers=workers, resume=resume, shard=part, advance=one)
             else:
-                from dask.distributed import Client
-
-                with Client(scheduler) as client:
-                    outcome = extract(plan, out, resume=resume, shard=part, advance=one, submit=client.submit)
+                with _client(scheduler) as client:
+                    submit = partial(client.submit, pure=False)  # pure: the result of an earlier run would do
+                    outcome = extract(plan, out, resume=resume, shard=part, advance=one, submit=submit)
+        except (StoreStopped, OSError) as error:
+            stop(f"{str(error).rstrip('.')}. --resume goes on.", SOME_FAILED)
         except StoreError as error:
             usage(str(error))
-        except ImportError:
-            usage("--scheduler needs Dask: pip install 'kcam[dask]'.")
+        except KeyboardInterrupt:
+            stop("interrupted; --resume goes on.", INTERRUPTED)
     lines = [f"warning: {warning}" for warning in outcome.warnings]
-    if outcome.finished and outcome.patches:
+    if outcome.finished and not outcome.found:
         left = ", ".join(f"{count} {reason}" for reason, count in sorted(outcome.dropped.items()) if count)
         lines.append(f"{outcome.patches} patches in {out}" + (f"; left out: {left}" if left else ""))
     elif outcome.finished:
@@ -96,6 +98,17 @@ def main(
         "finished": outcome.finished,
     }
     end(result, lines, as_json=as_json, failed=outcome.failed, report=report)
+
+
+def _client(scheduler: str):
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        usage("--scheduler needs Dask: pip install 'kcam[dask]'.")
+    try:
+        return Client(scheduler, timeout=30)
+    except (OSError, ValueError) as error:
+        usage(f"there is no Dask scheduler at {scheduler}: {(str(error).splitlines() or [''])[0]}")
 
 
 def _shard(text: str | None) -> tuple[int, int] | None:

@@ -22,6 +22,7 @@ import os
 import re
 import shutil
 import statistics
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -37,6 +38,7 @@ from PIL import Image  # noqa: E402
 
 import kcam.augmentation as KC  # noqa: E402
 from kcam import Camera, Plan, Scene, demo, optics, plots  # noqa: E402
+from kcam.data import FORMATS  # noqa: E402
 from kcam.optics.propagation import choose  # noqa: E402
 from kcam.optics.psf import Query  # noqa: E402
 from kcam.tradeoff import Row, Sweep  # noqa: E402
@@ -541,6 +543,67 @@ def figures(value: float) -> str:
     return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
+# ---- data sets and patches -------------------------------------------------------------------------------------------
+
+PATCHES = RESULTS / "patches.json"
+
+
+def formats_table() -> str:
+    """`kcam.data.FORMATS`."""
+    lines = ["| `--format` | what is read | cite |", "|---|---|---|"]
+    lines += [f"| `{row.name}` | {row.what} | {row.facts.get('citation', '')} |" for row in FORMATS.values()]
+    return "\n".join(lines)
+
+
+def throughput_table() -> str:
+    """Random patches per second from each store, and extraction against copying."""
+    content = json.loads(PATCHES.read_text())
+    rows = {(row["store"], row["state"]): row for row in content["reading"]}
+    lines = [
+        "| random patches per second | warm | kcam is faster by | cold | kcam is faster by |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for store in dict.fromkeys(store for store, state in rows if state != "skipped"):
+        cells = []
+        for state in ("warm", "cold"):
+            row = rows.get((store, state))
+            cells += ["", ""] if row is None else [figures(row["patches_per_second"]), times(row["kcam_is_faster"])]
+        lines.append(f"| {store} | {' | '.join(cells)} |")
+    made, copied = content["extraction"]
+    environment, shape = content["environment"], " x ".join(map(str, content["patch"]))
+    share = made["MB_per_second"] / copied["MB_per_second"]
+    lines += [
+        "",
+        f"Extraction with one worker wrote {figures(made['MB_per_second'])} MB of patches per second; copying the same "
+        f"files, and syncing them as extraction does, {figures(copied['MB_per_second'])} MB/s: {share:.0%} of it.",
+        "",
+        f"<sub>[`{PATCHES.name}`]({PATCHES.relative_to(ROOT)}): {content['patches']} patches of {shape}, "
+        f"{environment['machine']}, one process, {environment['date'][:10]}; {environment['clock']}, medians of "
+        f"{made['rounds']} to {rows['kcam store', 'warm']['rounds']} rounds by turns. Cold: dropped from the page "
+        "cache, not from the disk's own.</sub>",
+    ]
+    return "\n".join(lines)
+
+
+def times(value: float) -> str:
+    """How many times faster; losses are bold."""
+    return figures(value) if value >= 1 else f"**{figures(value)}**"
+
+
+def contact_sheet(path: Path) -> None:
+    """What `make demo-data` draws of its cubes."""
+    tools = ROOT / "data_tools"
+    with tempfile.TemporaryDirectory() as folder:
+        for tool, *arguments in (
+            ("demo_cubes.py", "--out", f"{folder}/cubes"),
+            ("inspect_cubes.py", f"{folder}/cubes", "--out", f"{folder}/report"),
+        ):
+            command = [sys.executable, str(tools / tool), *arguments]
+            subprocess.run(command, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+        picture = Image.open(f"{folder}/report/contact_sheet.png").convert("RGB")
+        picture.save(path, quality=88, optimize=True)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "propagators": propagators_table,
     "tradeoff": tradeoff_table,
@@ -552,6 +615,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "augmentations": augmentations_table,
     "augmentation_speed": augmentation_speed_table,
     "segmentation": segmentation_table,
+    "formats": formats_table,
+    "throughput": throughput_table,
 }
 
 # ---- the README ------------------------------------------------------------------------------------------------------
@@ -708,6 +773,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "tradeoff-thesis.png": tradeoff_picture,
     "peers.png": peers_picture,
     "plans.jpg": plans_picture,
+    "contact_sheet.jpg": contact_sheet,
 }
 
 

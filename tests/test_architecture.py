@@ -33,9 +33,9 @@ LAYERS = [
 LAYER = {module: index for index, row in enumerate(LAYERS) for module in row}
 METHODS = {("kcam.camera", "kcam.planner")}
 """camera.plan(...) is a method for the user's sake, but a planner is made of cameras: imported when it is called."""
-FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath"}
+FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath", "zarr"}
 """Not among the core dependencies: the library needs none of them at import, nor at run time."""
-LAZY = {"kcam.data": {"h5py", "cv2"}}
+LAZY = {"kcam.data": {"h5py", "cv2", "zarr"}}
 
 
 def part(path: Path) -> str:

@@ -17,6 +17,7 @@ from rich.console import Console
 sys.path.append(str(Path(__file__).parents[1]))
 
 from benchmarks import augmentation, bench, peers
+from benchmarks import patches as patch_stores
 from benchmarks.common import Contestant, race
 from kcam import augmentation as KC
 
@@ -210,3 +211,25 @@ def test_half_of_the_rows_are_drawn_at_one_half():
         torch.manual_seed(augmentation.half_of_the_rows(batch))
         params = KC.RandomDefocus(p=0.5).forward_parameters(torch.Size((batch, 3, 8, 8)))
         assert int(params["batch_prob"].sum()) == batch // 2
+
+
+# ---- patch stores --------------------------------------------------------------------------------------------------
+
+
+def test_patch_stores_are_timed_side_by_side(tmp_path):
+    assert patch_stores.main(["--quick", "--out", str(tmp_path / "patches.json"), "--folder", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "patches.json").read_text())
+    assert content["patches"] == 2 * 25
+    rows = {(row["store"], row["state"]): row for row in content["reading"]}
+    assert {store for store, _ in rows} == set(patch_stores.STORES)
+    for (store, state), row in rows.items():
+        if state == "skipped":
+            assert store in ("HDF5", "Zarr")
+            continue
+        assert row["patches_per_second"] > 0
+        assert row["rounds"] == 2
+        assert row["kcam_is_faster"] == 1 or store != "kcam store"
+    assert [row["what"] for row in content["extraction"]] == ["extract", "copy"]
+    assert all(row["MB_per_second"] > 0 for row in content["extraction"])
+    assert content["extraction"][0]["bytes"] == 2 * (25 * 4 * 32 * 32 * 2 + 128)
+    assert [path.name for path in tmp_path.iterdir()] == ["patches.json"]

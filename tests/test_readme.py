@@ -49,6 +49,7 @@ def load(path: Path) -> ModuleType:
 
 
 generate = load(ROOT / "docs" / "generate.py")
+sys.path.append(str(ROOT / "data_tools"))  # where its scripts find what they share
 
 
 def section(title: str) -> str:
@@ -168,6 +169,12 @@ def test_shell_command_exists(line: str) -> None:
         assert all(argument in pins for argument in arguments if "==" in argument)
     elif program == ".":
         assert arguments == [".venv/bin/activate"]
+    elif program == "python":
+        script, *options = arguments
+        app = typer.Typer()
+        app.command()(load(ROOT / script).main)
+        known = {option for parameter in typer.main.get_command(app).params for option in parameter.opts}
+        assert {option for option in options if option.startswith("--")} <= known
     else:
         assert (program, arguments) == ("python3", ["-m", "venv", ".venv"]), "a command that no test knows"
 

@@ -3,6 +3,7 @@
 from kcam.data.bands import parse_bands, resampling
 from kcam.data.cube import Cube, CubeError, write_cube
 from kcam.data.dataset import Patch, PatchDataset
+from kcam.data.export import export_patches
 from kcam.data.patches import Settings, StoreError, extract, make_plan, verify
 from kcam.data.readers import FORMATS, PROFILES, read_cube
 
@@ -15,6 +16,7 @@ __all__ = [
     "PatchDataset",
     "Settings",
     "StoreError",
+    "export_patches",
     "extract",
     "make_plan",
     "parse_bands",

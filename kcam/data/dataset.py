@@ -16,6 +16,9 @@ from torch.utils.data import Dataset
 from kcam.data.patches import read_manifest, scene_array
 from kcam.units import nm
 
+MOST_OPEN = 256
+"""Files that a data set holds mapped: each is an open file, of which a process often has 1024."""
+
 
 class Patch(NamedTuple):
     """values: (L,H,W) float32. wavelengths: (L,) float64 [m]. scene: its name."""
@@ -49,11 +52,19 @@ class PatchDataset(Dataset[Patch]):
     def __getitem__(self, index: int) -> Patch:
         place, number = self._place(index)
         record = self.scenes[place]
-        if place not in self._arrays:
-            self._arrays[place] = scene_array(self.folder, self.manifest, record)
-        numbers = self._arrays[place][number]
-        values = torch.from_numpy(numbers.astype(np.float32)) * record["scale"]
+        numbers = self._array(place)[number]
+        values = torch.from_numpy(numbers.astype(np.float32)).mul_(record["scale"])
         return Patch(values, self.wavelengths, record["scene"])
+
+    def _array(self, place: int) -> np.ndarray:
+        """The patches of a scene, mapped; of many scenes those that were asked for last."""
+        found = self._arrays.pop(place, None)
+        if found is None:
+            if len(self._arrays) >= MOST_OPEN:
+                del self._arrays[next(iter(self._arrays))]
+            found = scene_array(self.folder, self.manifest, self.scenes[place])
+        self._arrays[place] = found
+        return found
 
     def position(self, index: int) -> tuple[str, int, int]:
         """Where a patch was cut: (scene, y, x) of its top left pixel."""

@@ -10,20 +10,27 @@ same. While it is being made, a folder .work holds a plan and a record of each s
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import math
+import os
 import re
 import shutil
+import signal
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
+from multiprocessing import active_children, connection, get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
 
+from kcam import __version__
 from kcam.data.cube import SUFFIX, CubeError, Source, open_cube
 from kcam.files import replace, replacing
 from kcam.units import nm
@@ -36,6 +43,10 @@ _HEADER = 128  # bytes before the values of a .npy of this shape
 
 class StoreError(ValueError):
     """A patch store that cannot be made, continued or read; one line."""
+
+
+class StoreStopped(StoreError):
+    """A store that is not finished, for a reason that lies in none of its cubes; resume goes on with it."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +74,11 @@ class Settings:
             if getattr(self, name) < 1:
                 raise StoreError(f"{name} must be 1 pixel or more, got {getattr(self, name)}.")
         shares = [share for _, share in self.split]
-        if not shares or min(shares) < 0 or abs(sum(shares) - 1) > 1e-6:
+        if not shares or min(shares) < 0 or not abs(sum(shares) - 1) <= 1e-6:
             raise StoreError(f"the shares of the split must be >= 0 and sum to 1, got {shares}.")
+        for name in ("min_mean", "min_contrast", "max_clipped", "max_invalid"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise StoreError(f"{name} must be 0 or more, got {getattr(self, name)}.")
         if self.group is not None:
             try:
                 re.compile(self.group)
@@ -86,7 +100,7 @@ def parse_split(text: str) -> tuple[tuple[str, float], ...]:
 
 @dataclass(frozen=True)
 class SceneJob:
-    """A scene of a plan: where it is, and what its header said."""
+    """A scene of a plan: where it is, what its header said, and a fingerprint of its file."""
 
     name: str
     path: str
@@ -94,6 +108,7 @@ class SceneJob:
     split: str
     shape: tuple[int, int, int]
     bytes: int
+    fingerprint: str
 
 
 @dataclass(frozen=True)
@@ -108,7 +123,7 @@ class StorePlan:
     @property
     def hash(self) -> str:
         """Of everything that decides the bytes of the store."""
-        scenes = [[job.name, job.group, job.split, job.shape, job.bytes] for job in self.scenes]
+        scenes = [[job.name, job.group, job.split, job.shape, job.bytes, job.fingerprint] for job in self.scenes]
         text = json.dumps([VERSION, asdict(self.settings), self.wavelengths, scenes], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -150,11 +165,12 @@ def group_of(name: str, facts: dict[str, Any], pattern: str | None) -> str:
     return str(facts.get("group", name))
 
 
-def make_plan(cubes: Path, settings: Settings) -> StorePlan:
+def make_plan(cubes: str | os.PathLike[str], settings: Settings) -> StorePlan:
     """Plan a store from a folder of cube files, from their headers alone.
 
     Raises:    StoreError where there is no cube to read.
     """
+    cubes = Path(cubes)
     paths = sorted(cubes.glob(f"*{SUFFIX}")) if cubes.is_dir() else [cubes]
     paths = [path for path in paths if not path.name.startswith(".")]
     if not paths:
@@ -179,10 +195,22 @@ def make_plan(cubes: Path, settings: Settings) -> StorePlan:
             failed[name] = f"it is {source.shape[1]} x {source.shape[2]}, smaller than a patch of {settings.size}."
             continue
         group = group_of(name, source.facts, settings.group)
-        jobs.append(
-            SceneJob(name, str(path), group, split_of(group, settings.split), source.shape, path.stat().st_size)
-        )
+        if re.search(r"[\\\x00-\x1f\ud800-\udfff]", name + group):
+            failed[name] = f"its name {name!r} cannot be that of a file everywhere. Rename it."
+            continue
+        split, size = split_of(group, settings.split), path.stat().st_size
+        jobs.append(SceneJob(name, str(path.resolve()), group, split, source.shape, size, _fingerprint(path, size)))
     return StorePlan(settings, grid, tuple(sorted(jobs, key=lambda job: job.name)), failed)
+
+
+def _fingerprint(path: Path, size: int) -> str:
+    """Of 16 blocks of a file, its first and last among them: tells another cube of the same size without reading it."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        for place in range(16):
+            file.seek(max(0, size - 4096) * place // 15)
+            digest.update(file.read(4096))
+    return digest.hexdigest()
 
 
 def _opened(path: Path) -> Source:
@@ -265,25 +293,22 @@ def _brightest(source: Source, strip: int) -> np.float32:
     for first in range(0, source.shape[1], strip):
         values, _ = source.checked_rows(first, min(first + strip, source.shape[1]))
         high = max(high, values.max())
-    if not high > 0:
+    if not high > 1e-30:  # below, 65535 / high leaves float32
         raise CubeError("it is black: no value is above 0.")
     return np.float32(high)
 
 
 def _strips(source: Source, settings: Settings) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
     """(y, rows y to y + size, their valid pixels); rows that two strips share are read once."""
-    size, stride = settings.size, settings.stride
-    values, valid = np.empty((0,)), np.empty((0,))
+    size, (bands, height, width) = settings.size, source.shape
+    values, valid = np.empty((bands, size, width), np.float32), np.empty((size, width), bool)
     last = 0
-    for top in range(0, source.shape[1] - size + 1, stride):
+    for top in range(0, height - size + 1, settings.stride):
         keep = max(0, last - top)
-        new, pixels = source.checked_rows(top + keep, top + size)
-        marks = np.ones(new.shape[1:], bool) if pixels is None else pixels
-        if keep:
-            values = np.concatenate([values[:, -keep:], new], axis=1)
-            valid = np.concatenate([valid[-keep:], marks])
-        else:
-            values, valid = new, marks
+        for plane in (*values, valid):  # a plane at a time: numpy copies what overlaps
+            plane[:keep] = plane[size - keep :]
+        values[:, keep:], marks = source.checked_rows(top + keep, top + size)
+        valid[keep:] = True if marks is None else marks
         last = top + size
         yield top, values, None if valid.all() else valid
 
@@ -307,7 +332,7 @@ def _reason(patch: np.ndarray, valid: np.ndarray | None, scale: np.float32, sett
 @dataclass
 class Outcome:
     """What a run did. done, skipped: scenes made now, and found done. failed: scene to reason. finished: the manifests
-    are written.
+    are written; found: they were before.
     """
 
     done: list[str] = field(default_factory=list)
@@ -315,13 +340,14 @@ class Outcome:
     failed: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     finished: bool = False
+    found: bool = False
     patches: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
 
 
 def extract(
     plan: StorePlan,
-    out: Path,
+    out: str | os.PathLike[str],
     *,
     workers: int = 1,
     resume: bool = False,
@@ -336,33 +362,28 @@ def extract(
                submit: of an executor with futures of its own, such as that of a `dask.distributed.Client`.
     Raises:    StoreError for a folder that holds something else, a store of another plan, or too small a disk.
     """
+    out = Path(out)
     outcome = Outcome(failed=dict(plan.failed))
     work = out / WORK
     finished = _finished(out)
     if finished is not None:
         if not resume:
             raise StoreError(f"{out} holds a store already. Use another folder, or --resume.")
-        if finished != plan.hash:
+        if finished["plan"] != plan.hash:
             raise StoreError(f"{out} holds a store of other cubes or settings. Use another folder.")
-        outcome.finished, outcome.skipped = True, [job.name for job in plan.scenes]
+        shutil.rmtree(work, ignore_errors=True)  # empty, where a run was killed in its last moment
+        missing = dict.fromkeys(finished["failed"], "it failed when the store was made.")
+        outcome.finished, outcome.found, outcome.failed = True, True, missing | outcome.failed
+        outcome.skipped = [job.name for job in plan.scenes if job.name not in missing]
         return outcome
-    if out.exists() and any(out.iterdir()):
-        begun = (work / "plan.json").is_file()
-        if not begun or not (resume or shard):
-            fix = "--resume goes on with it" if begun else "choose an empty folder"
-            raise StoreError(f"{out} is not empty; {fix}.")
-        if json.loads((work / "plan.json").read_text())["hash"] != plan.hash:
-            raise StoreError(f"{out} was begun with other cubes or settings. Use another folder, or the same ones.")
-    else:
-        _check_disk(plan, out)
+    _check_folder(plan, out, goes_on=resume or shard is not None)
+    jobs = [job for index, job in enumerate(plan.scenes) if shard is None or index % shard[1] == shard[0] - 1]
+    waiting = [job for job in jobs if _done(job, plan.settings, out) is None]
+    _check_disk(plan, waiting, out)
     (work / "done").mkdir(parents=True, exist_ok=True)
     replace(work / "plan.json", json.dumps({"hash": plan.hash}).encode())
-    jobs = [job for index, job in enumerate(plan.scenes) if shard is None or index % shard[1] == shard[0] - 1]
-    waiting = []
     for job in jobs:
-        if _done(job, plan.settings, out) is None:
-            waiting.append(job)
-        else:
+        if job not in waiting:
             outcome.skipped.append(job.name)
             if advance:
                 advance(job.name, job.bytes)
@@ -379,33 +400,101 @@ def extract(
     return outcome
 
 
+def _check_folder(plan: StorePlan, out: Path, *, goes_on: bool) -> None:
+    """StoreError for a folder that holds something else than the beginning of this store."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise StoreError(f"{out} is a file. Choose a folder.")
+    found = {path.name for path in out.iterdir()}
+    begun = out / WORK / "plan.json"
+    # a run that was killed before it could write its plan leaves the folder of it, and nothing else
+    if found and not (begun.is_file() or found == {WORK}):
+        raise StoreError(f"{out} is not empty; choose an empty folder.")
+    if found and not goes_on:
+        raise StoreError(f"{out} is not empty; --resume goes on with it.")
+    if begun.is_file():
+        try:
+            same = json.loads(begun.read_text())["hash"] == plan.hash
+        except (ValueError, KeyError, TypeError) as error:
+            raise StoreError(f"{begun} is damaged: {error}. Choose an empty folder.") from error
+        if not same:
+            raise StoreError(f"{out} was begun with other cubes or settings. Use another folder, or the same ones.")
+
+
 def _run(
     jobs: Sequence[SceneJob], settings: Settings, out: Path, *, workers: int, submit: Callable[..., Any] | None
 ) -> Iterator[tuple[SceneJob, str | None]]:
     """Each job and why it failed, or None, as they are done."""
+    folder = str(out.resolve())  # a worker may be at home in another folder
     if submit is not None:
-        futures = {job: submit(work_on, job, settings, str(out)) for job in jobs}
+        futures = {job: submit(work_on, job, settings, folder) for job in jobs}
         for job, future in futures.items():
-            yield job, future.result()
+            try:
+                failure = future.result()
+            except StoreError:
+                raise
+            except Exception as error:
+                raise StoreStopped(f"a worker failed at {job.name}: {type(error).__name__}: {error}") from error
+            yield job, failure
     elif workers <= 1 or len(jobs) <= 1:
         for job in jobs:
-            yield job, work_on(job, settings, str(out))
+            yield job, work_on(job, settings, folder)
     else:
-        with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
-            running = {pool.submit(work_on, job, settings, str(out)): job for job in jobs}
+        yield from _spread(jobs, settings, folder, workers)
+
+
+def _spread(
+    jobs: Sequence[SceneJob], settings: Settings, folder: str, workers: int
+) -> Iterator[tuple[SceneJob, str | None]]:
+    """`_run` over processes here. They end with this one, however it ends."""
+    others = active_children()
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=_as_worker) as pool:
+        running = {pool.submit(work_on, job, settings, folder): job for job in jobs}
+        try:
             for future in as_completed(running):
                 yield running[future], future.result()
+        except BrokenProcessPool as error:
+            raise StoreStopped("a worker process was killed; out of memory? Go on with fewer --workers.") from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in active_children():
+                if child not in others:
+                    child.terminate()
+            raise
+
+
+def _as_worker() -> None:
+    """Leave Ctrl-C to the parent, and end with it: a worker that outlives it would wait for work forever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is not None:
+
+        def end() -> None:
+            connection.wait([parent.sentinel])
+            os._exit(1)
+
+        Thread(target=end, daemon=True).start()
 
 
 def work_on(job: SceneJob, settings: Settings, out: str) -> str | None:
-    """One scene: its patches, then its record. Returns why it failed, or None."""
+    """One scene: its patches, then its record. Returns why it failed, or None.
+
+    Raises:    StoreStopped where the disk takes no more: that is no fault of the scene.
+    """
     try:
         record = extract_scene(job, settings, Path(out) / job.split / "scenes")
         replace(Path(out) / WORK / "done" / f"{job.name}.json", json.dumps(record, sort_keys=True).encode())
     except (CubeError, StoreError) as error:
         return str(error)
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+            raise StoreStopped(f"{job.name} cannot be written: {error.strerror}.") from error
         return f"{type(error).__name__}: {error.strerror or error}"
+    except MemoryError:
+        return "it does not fit into memory."
+    except Exception as error:
+        return f"it cannot be read: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
     return None
 
 
@@ -428,9 +517,11 @@ def _finish(plan: StorePlan, out: Path, outcome: Outcome) -> None:
         own = [record for record in records if record["split"] == name]
         if not own:
             outcome.warnings.append(f"the split {name} received no scene: there are too few groups for its share.")
+        elif not any(record["count"] for record in own):
+            outcome.warnings.append(f"the split {name} has no patch: the filters left out all of them.")
         folder = out / name
         folder.mkdir(parents=True, exist_ok=True)
-        for left in (folder / "scenes").glob(".*.tmp"):
+        for left in folder.rglob(".*.tmp"):
             left.unlink()
         replace(folder / MANIFEST, _manifest(plan, name, own, sorted(outcome.failed)))
     outcome.patches = sum(record["count"] for record in records)
@@ -438,6 +529,8 @@ def _finish(plan: StorePlan, out: Path, outcome: Outcome) -> None:
         for reason, count in record["dropped"].items():
             outcome.dropped[reason] = outcome.dropped.get(reason, 0) + count
     shutil.rmtree(out / WORK / "done")
+    for left in (out / WORK).glob(".*.tmp"):
+        left.unlink()
     (out / WORK / "plan.json").unlink()  # last, so that an interrupted end can be gone on with
     (out / WORK).rmdir()
     outcome.finished = True
@@ -459,6 +552,7 @@ def _manifest(plan: StorePlan, split: str, records: list[dict[str, Any]], failed
     hidden = ("sum", "sum_of_squares", "split")
     document = {
         "kcam_patches": VERSION,
+        "kcam": __version__,
         "split": split,
         "plan": plan.hash,
         "settings": asdict(plan.settings),
@@ -471,27 +565,35 @@ def _manifest(plan: StorePlan, split: str, records: list[dict[str, Any]], failed
         "failed": failed,
         "scenes": [{key: value for key, value in record.items() if key not in hidden} for record in records],
     }
-    return (json.dumps(document, indent=1, sort_keys=True) + "\n").encode()
+    return (json.dumps(document | {"sha256": _digest(document)}, indent=1, sort_keys=True) + "\n").encode()
 
 
-def _finished(out: Path) -> str | None:
-    """The plan's hash of a finished store; None where there is none, or it is still being made."""
-    if (out / WORK).exists():
+def _digest(document: dict[str, Any]) -> str:
+    """Of a manifest without its own digest."""
+    own = {key: value for key, value in document.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+def _finished(out: Path) -> dict[str, Any] | None:
+    """A manifest of a finished store; None where there is none, or it is still being made."""
+    if (out / WORK / "plan.json").exists():
         return None
     for path in sorted(out.glob(f"*/{MANIFEST}")):
         try:
-            return str(json.loads(path.read_text())["plan"])
-        except (OSError, ValueError, KeyError, TypeError):
+            return read_manifest(path.parent)
+        except (OSError, StoreError):
             continue
     return None
 
 
-def _check_disk(plan: StorePlan, out: Path) -> None:
+def _check_disk(plan: StorePlan, jobs: Sequence[SceneJob], out: Path) -> None:
+    """StoreError where the scenes may not fit onto the disk."""
     existing = next(folder for folder in (out, *out.resolve().parents) if folder.exists())
     free = shutil.disk_usage(existing).free
-    if plan.most_bytes > 0.95 * free:
+    needed = StorePlan(plan.settings, plan.wavelengths, tuple(jobs)).most_bytes
+    if needed > 0.95 * free:
         raise StoreError(
-            f"up to {plan.most_bytes / 1e9:.3g} GB are needed and {free / 1e9:.3g} GB are free. Use a larger "
+            f"up to {needed / 1e9:.3g} GB are needed and {free / 1e9:.3g} GB are free. Use a larger "
             "stride, or another disk."
         )
 
@@ -516,6 +618,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         bands, height, width = (int(size) for size in document["patch"])
         if len(document["wavelengths_nm"]) != bands or height != width or document["dtype"] != "<u2":
             raise StoreError(f"{path} does not fit together.")
+        if document["sha256"] != _digest(document):
+            raise StoreError(f"{path} is not what was written: its own sha256 differs.")
         for record in document["scenes"]:
             count, positions_, scale = record["count"], record["positions"], record["scale"]
             if len(positions_) != count or not scale > 0 or not re.fullmatch(r"scenes/[^/\\]+\.npy", record["file"]):
@@ -538,46 +642,61 @@ def scene_array(folder: Path, document: dict[str, Any], record: dict[str, Any]) 
         if not record["count"]:
             return np.empty(shape, "<u2")
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        if isinstance(error, StoreError):
-            raise
+    except StoreError:
+        raise
+    except Exception as error:  # a damaged header is a TypeError, a SyntaxError and others
         raise StoreError(f"{path} cannot be read: {error}.") from error
     if found.shape != shape or found.dtype != np.dtype("<u2"):
         raise StoreError(f"{path} holds {found.shape} of {found.dtype}, expected {shape} of uint16.")
     return found
 
 
-def verify(store: Path) -> list[str]:
-    """What is wrong with a store, a line each; nothing where all files are as they were written.
+def verify(store: str | os.PathLike[str]) -> list[str]:
+    """What is wrong with a store, or with one split of it, a line each; nothing where all files are as written.
 
-    Every file against its sha256, no file too many, no group of scenes in two splits, one plan.
+    Every file against its sha256, none missing and none too many (but run logs, *.log), all splits there and of one
+    plan, every group of scenes in the split that its name's hash says and in no other.
     """
-    folders = [store] if (store / MANIFEST).is_file() else sorted(path.parent for path in store.glob(f"*/{MANIFEST}"))
+    store = Path(store)
+    one = (store / MANIFEST).is_file()
+    folders = [store] if one else sorted(path.parent for path in store.glob(f"*/{MANIFEST}"))
     problems = []
     if (store / WORK).exists():
         problems.append(f"{store} is not finished: go on with extract_patches --resume.")
     if not folders:
         return [*problems, f"{store} holds no {MANIFEST}: it is no patch store."]
     groups: dict[str, str] = {}
-    plans = set()
+    known = {folder / MANIFEST for folder in folders}
+    documents = {}
     for folder in folders:
         try:
-            document = read_manifest(folder)
+            documents[folder] = read_manifest(folder)
         except (StoreError, OSError) as error:
             problems.append(str(error))
-            continue
-        plans.add(document["plan"])
-        known = {folder / record["file"] for record in document["scenes"]}
-        problems += [
-            f"{path} is in no manifest." for path in sorted((folder / "scenes").glob("*")) if path not in known
-        ]
+    for folder, document in documents.items():
+        split, shares = document["split"], document["settings"]["split"]
+        if not one and split != folder.name:
+            problems.append(f"{folder} holds the split {split}.")
         for record in document["scenes"]:
-            other = groups.setdefault(record["group"], folder.name)
-            if other != folder.name:
-                problems.append(f"the group {record['group']} stands in {other} and in {folder.name}.")
+            known.add(folder / record["file"])
+            group = record["group"]
+            other = groups.setdefault(group, split)
+            if other != split:
+                problems.append(f"the group {group} stands in {other} and in {split}.")
+            elif split_of(group, shares) != split:
+                problems.append(f"the group {group} stands in {split} and belongs to {split_of(group, shares)}.")
             problems += _file_problems(folder, document, record)
-    if len(plans) > 1:
+    if not one:
+        expected = {name for document in documents.values() for name, _ in document["settings"]["split"]}
+        missing = sorted(name for name in expected if not (store / name / MANIFEST).is_file())
+        problems += [f"{store / name} has no {MANIFEST}." for name in missing]
+    if len({document["plan"] for document in documents.values()}) > 1:
         problems.append("the splits are of different plans.")
+    if len(documents) == len(folders):  # else, all that a damaged manifest speaks of would be too much
+        for path in sorted(store.rglob("*")):
+            inside = WORK in path.relative_to(store).parts
+            if path not in known and not inside and path.suffix != ".log" and not path.is_dir():
+                problems.append(f"{path} is in no manifest.")
     return problems
 
 
