@@ -225,6 +225,7 @@ def _scaled(values: np.ndarray, divisor: float, clip: bool = False) -> np.ndarra
 def _open_kaist(path: Path, options: Options) -> Source:
     """KAIST (Choi et al. 2017): one scanline EXR, channels w420nm ... w720nm; reflectance against Spectralon."""
     try:
+        import Imath
         import OpenEXR
     except ImportError as error:
         raise ImportError("KAIST's files are OpenEXR, which the extra reads: pip install 'kcam[exr]'.") from error
@@ -245,11 +246,12 @@ def _open_kaist(path: Path, options: Options) -> Source:
     _check_bomb(2 * len(found) * height * width, path.stat().st_size)
     ordered = sorted(found, key=found.__getitem__)
     grid = _nanometres([found[name] for name in ordered])
+    pixel_type = Imath.PixelType(Imath.PixelType.FLOAT)
 
     def rows(first: int, last: int) -> tuple[np.ndarray, None]:
         file = OpenEXR.InputFile(str(path))
         try:
-            lines = file.channels(ordered, OpenEXR.FLOAT, window.min.y + first, window.min.y + last - 1)
+            lines = file.channels(ordered, pixel_type, window.min.y + first, window.min.y + last - 1)
         finally:
             file.close()
         values = np.empty((len(ordered), last - first, width), np.float32)
@@ -638,7 +640,7 @@ def _open_npz(path: Path, options: Options) -> Source:
         values = _npy(archive, member)
         if "wavelengths" in heads and np.prod(heads["wavelengths"][0], dtype=np.int64) <= 10_000:
             own = _npy(archive, heads["wavelengths"][2]).astype(np.float64).ravel()
-            own = own if own.max(initial=1) < 1e-3 else _nanometres(own)
+            own = own if 0 < own.max(initial=0) < 1e-3 else _nanometres(own)
     grid = own if options.wavelengths is None else options.wavelengths
     if grid is not None and values.shape[0] != len(grid) and values.shape[2] == len(grid):
         values = values.transpose(2, 0, 1)
