@@ -13,7 +13,7 @@ METHODS = ("pchip", "cubic")
 EDGES = ("error", "hold")
 COARSER = 1.5
 """A target band this many times as far from its neighbours as the source's is averaged over its width."""
-_SLACK = 0.5 * nm  # a band may lie this far outside the source without counting as a guess
+_SLACK = 0.1 * nm  # a band may lie this far outside the source without counting as a guess
 _AVERAGED = 33  # samples across a band
 
 
@@ -49,7 +49,7 @@ def resampling(source: np.ndarray, target: np.ndarray, *, method: str = "pchip",
     Args:      source: (S,), target: (T,) [m], in any order, no two of the source equal.
                method: "pchip" never gives a negative value from values that are not; "cubic" is ten times as accurate
                on smooth spectra and may overshoot.
-               edge: what to do with bands beyond the source's ends (by more than 0.5 nm): "error", or "hold" the last
+               edge: what to do with bands beyond the source's ends (by more than 0.1 nm): "error", or "hold" the last
                value and mark them.
     Raises:    ValueError for a grid with equal wavelengths, an unknown method or edge, or bands that would be
         extrapolated.
