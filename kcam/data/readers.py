@@ -95,6 +95,8 @@ def open_source(path: Path, *, format: str | None = None, options: Options | Non
     """A cube that is read strip by strip. Errors as `read_cube`."""
     if not path.exists():
         raise FileNotFoundError(f"there is no file or folder {path}.")
+    if not (path.is_file() or path.is_dir()):
+        raise CubeError("it is neither a file nor a folder.")
     row = None if format is None else FORMATS.get(format)
     if format is not None and row is None:
         raise ValueError(f"unknown format {format!r}; known: {', '.join(FORMATS)}.")
@@ -428,7 +430,7 @@ def _cave_files(path: Path) -> list[tuple[int, Path]]:
         found = []
         for file in folder.iterdir():
             match = re.fullmatch(r".*_ms_(\d+)\.png", file.name, re.IGNORECASE)
-            if match and not file.name.startswith("."):
+            if match and not file.name.startswith(".") and file.is_file():
                 found.append((int(match[1]), file))
         if found:
             return sorted(found)
