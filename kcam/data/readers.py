@@ -231,16 +231,13 @@ def _open_kaist(path: Path, options: Options) -> Source:
         import OpenEXR
     except ImportError as error:
         raise ImportError("KAIST's files are OpenEXR, which the extra reads: pip install 'kcam[exr]'.") from error
-    file = OpenEXR.InputFile(str(path))
-    try:
-        header, complete = file.header(), file.isComplete()
-    finally:
-        file.close()
-    names, window = list(header["channels"]), header["dataWindow"]
-    height, width = window.max.y - window.min.y + 1, window.max.x - window.min.x + 1
+    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:  # InputFile.header() may crash
+        if len(file.parts) != 1:
+            raise CubeError(f"it has {len(file.parts)} parts, expected one.")
+        names = list(file.channels())
+        (left, top), (right, bottom) = ((int(x), int(y)) for x, y in file.header()["dataWindow"])
+    height, width = bottom - top + 1, right - left + 1
     _check_size((len(names), height, width), "its data window")
-    if not complete:
-        raise CubeError("it is cut off: lines are missing.")
     found = {name: float(match[1]) for name in names if (match := re.fullmatch(r"w(\d+(?:\.\d+)?)nm", name))}
     strange = sorted(set(names) - set(found) - set("RGBAYZ"))
     if not found or strange:
@@ -253,7 +250,9 @@ def _open_kaist(path: Path, options: Options) -> Source:
     def rows(first: int, last: int) -> tuple[np.ndarray, None]:
         file = OpenEXR.InputFile(str(path))
         try:
-            lines = file.channels(ordered, pixel_type, window.min.y + first, window.min.y + last - 1)
+            if not file.isComplete():
+                raise CubeError("it is cut off: lines are missing.")
+            lines = file.channels(ordered, pixel_type, top + first, top + last - 1)
         finally:
             file.close()
         values = np.empty((len(ordered), last - first, width), np.float32)

@@ -54,9 +54,7 @@ def _rgb(folder: Path) -> Written:
     path = folder / "photo.png"
     Image.fromarray(pixels).save(path)
     cube = read_cube(path, format="rgb")  # against itself: here only the damage is looked at
-    return Written(
-        path, cube.values.numpy(), tuple((cube.wavelengths / nm).tolist()), 0, "rgb", "reflectance"
-    )
+    return Written(path, cube.values.numpy(), tuple((cube.wavelengths / nm).tolist()), 0, "rgb", "reflectance")
 
 
 WRITERS: dict[str, Callable[[Path], Written]] = {
@@ -194,7 +192,9 @@ def _hdf5(folder: Path, make: Callable[[h5py.File], object], *, bands: Any = Non
 
 def _external(folder: Path) -> Path:
     (folder / "secret").write_bytes(bytes(1000))
-    return _hdf5(folder, lambda f: f.create_dataset("rad", (31, 4, 5), "u1", external=[(str(folder / "secret"), 0, 620)]))
+    return _hdf5(
+        folder, lambda f: f.create_dataset("rad", (31, 4, 5), "u1", external=[(str(folder / "secret"), 0, 620)])
+    )
 
 
 def _link(folder: Path) -> Path:
@@ -479,7 +479,9 @@ def plainly(case: Damaged) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values, grid = np.stack([channels[key] for _, key in bands]), np.array([value for value, _ in bands])
     elif kind in ("icvl", "arad1k"):
         with h5py.File(path, "r") as file:
-            values = file["rad" if kind == "icvl" else "cube"][()].transpose(0, 2, 1) / (4095 if kind == "icvl" else 1)
+            with np.errstate(all="ignore"):  # cubes are float32: what is beyond it has no value
+                values = file["rad" if kind == "icvl" else "cube"][()].transpose(0, 2, 1).astype(np.float32)
+            values = values / np.float32(4095 if kind == "icvl" else 1)
             grid = file["bands"][()].ravel()
     elif kind == "harvard":
         content = loadmat(path)
@@ -507,7 +509,7 @@ def plainly(case: Damaged) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         with tifffile.TiffFile(path) as file:
             values = file.series[0].asarray()
         values = values if len(values) == 31 else values.transpose(2, 0, 1)
-        values = values / {"u": 256.0**values.dtype.itemsize - 1}.get(values.dtype.kind, 1.0)
+        values = values / {"uint8": 255.0, "uint16": 65535.0}.get(values.dtype.name, 1.0)
         grid = np.asarray(writers.GRID_400, float)
     else:
         assert kind == "kcam", kind
@@ -523,7 +525,7 @@ def plainly(case: Damaged) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def verdict(case: Damaged) -> str:
-    """"refused", "same" or "as it says"; AssertionError for anything else."""
+    """ "refused", "same" or "as it says"; AssertionError for anything else."""
     try:
         cube = read_cube(case.path, **case.how)
     except (CubeError, FileNotFoundError) as error:
