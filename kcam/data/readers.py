@@ -231,11 +231,14 @@ def _open_kaist(path: Path, options: Options) -> Source:
         import OpenEXR
     except ImportError as error:
         raise ImportError("KAIST's files are OpenEXR, which the extra reads: pip install 'kcam[exr]'.") from error
-    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:  # InputFile.header() may crash
+    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:  # InputFile.header() can crash
         if len(file.parts) != 1:
             raise CubeError(f"it has {len(file.parts)} parts, expected one.")
-        names = list(file.channels())
+        channels = [(channel.name, channel.xSampling, channel.ySampling) for channel in file.header()["channels"]]
         (left, top), (right, bottom) = ((int(x), int(y)) for x, y in file.header()["dataWindow"])
+    names = [name for name, _, _ in channels]
+    if any(steps != [1, 1] for _, *steps in channels):
+        raise CubeError("some of its channels have fewer pixels than others.")
     height, width = bottom - top + 1, right - left + 1
     _check_size((len(names), height, width), "its data window")
     found = {name: float(match[1]) for name in names if (match := re.fullmatch(r"w(\d+(?:\.\d+)?)nm", name))}

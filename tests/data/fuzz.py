@@ -388,7 +388,8 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "npz with a path": (lambda f: _zip(f / "a.npz", {"../../cube.npy": _npy_bytes(_head_of("(3, 4, 5)"))}), {}),
     "npz of text": (lambda f: _zip(f / "a.npz", {"cube.npy": b"hello"}), {}),
     "npz of nothing": (lambda f: _zip(f / "a.npz", {}), {}),
-    "npz of structures": (lambda f: _npz_with(f, "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (3,)}"), {}),
+    "npz of structures": (
+        lambda f: _npz_with(f, "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (3,)}"), {}),
     "npz of complex numbers": (lambda f: _npz_with(f, _head_of("(31, 1, 1)", "<c8"), bytes(248)), {}),
     "hdf5 with values elsewhere": (_external, {}),
     "hdf5 with a link elsewhere": (_link, {}),
@@ -441,7 +442,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     **{f"empty {suffix}": (_empty(suffix), {}) for suffix in (".exr", ".mat", ".hdr", ".tif", ".npz", ".npy", ".png")},
     **{
         f"empty {suffix} as {name}": (_empty(suffix), {"format": name})
-        for suffix, name in ((".exr", "kaist"), (".mat", "icvl"), (".mat", "harvard"), (".tif", "tiff"), (".png", "rgb"))
+        for suffix, name in (
+            (".exr", "kaist"), (".mat", "icvl"), (".mat", "harvard"), (".tif", "tiff"), (".png", "rgb"),
+        )
     },
     **{
         f"a folder as {name}": (_folder(suffix), {"format": name})
@@ -501,7 +504,7 @@ def plainly(case: Damaged) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         size = {"l": number["lines"], "s": number["samples"], "b": number["bands"]}
         axes = {"bsq": "bls", "bil": "lbs", "bip": "lsb"}[re.search(r"interleave *= *(\w+)", text)[1].lower()]
         stored = np.fromfile(case.clean.target, order + kind_of).reshape([size[axis] for axis in axes])
-        factor = re.search(r"factor *= *(\S+)", text)
+        factor = re.search(r"^reflectance scale factor *= *(\S+)", text, re.MULTILINE | re.IGNORECASE)
         values = stored.transpose([axes.index(axis) for axis in "bls"]) / (float(factor[1]) if factor else 1)
         listed = re.search(r"^wavelength *= *\{([^}]*)\}", text, re.MULTILINE)[1]
         grid = np.array([float(value) for value in listed.split(",")])
