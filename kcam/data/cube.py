@@ -181,8 +181,8 @@ def write_cube(path: str | os.PathLike[str], cube: Cube) -> None:
     )
 
 
-STRIP = 2**25
-"""Values that are held at once: 128 MB."""
+STRIP = 2**24
+"""Values of a cube that are held at once: 64 MB, some three times over."""
 
 
 def write_source(path: str | os.PathLike[str], source: Source) -> dict[str, Any]:
@@ -207,20 +207,23 @@ def write_source(path: str | os.PathLike[str], source: Source) -> dict[str, Any]
     with replacing(path) as temporary:
         text = json.dumps(document, sort_keys=True)
         large = 4 * bands * height * width > 2**32 - 2**26
-        values = tifffile.memmap(
-            temporary, shape=source.shape, dtype=np.float32, description=text, bigtiff=large, **how
+        made = tifffile.memmap(
+            temporary, shape=source.shape, dtype=np.float32, description=text, bigtiff=large, byteorder="<", **how
         )
-        for first in range(0, height, strip):
-            last = min(first + strip, height)
-            part, valid = source.checked_rows(first, last)
-            values[:, first:last] = part
-            if valid is not None:
-                invalid[first:last] = ~valid
-            low, high = min(low, float(part.min())), max(high, float(part.max()))
+        start = made.offset
+        del made
+        with temporary.open("rb+") as file:  # through the mapping, all that was written would stay in memory
+            for first in range(0, height, strip):
+                last = min(first + strip, height)
+                part, valid = source.checked_rows(first, last)
+                for band, plane in enumerate(part.astype("<f4", copy=False)):
+                    file.seek(start + 4 * width * (band * height + first))
+                    file.write(plane.tobytes())
+                if valid is not None:
+                    invalid[first:last] = ~valid
+                low, high = min(low, float(part.min())), max(high, float(part.max()))
         if invalid.all():
             raise CubeError("it holds no valid pixel: all are NaN, infinite or marked as invalid.")
-        values.flush()
-        del values
         with tifffile.TiffWriter(temporary, append=True) as file:
             if invalid.any():
                 file.write((~invalid).astype(np.uint8) * 255, **how)
