@@ -14,6 +14,7 @@ EDGES = ("error", "hold")
 COARSER = 1.5
 """A target band this many times as far from its neighbours as the source's is averaged over its width."""
 _SLACK = 0.1 * nm  # a band may lie this far outside the source without counting as a guess
+_MOST_BANDS = 10_000
 _AVERAGED = 33  # samples across a band
 
 
@@ -30,13 +31,14 @@ def parse_bands(text: str) -> np.ndarray:
 
     Raises:    ValueError for anything else.
     """
+    complaint = f"bands {text!r} is not start:stop:count in nm, such as 420:720:28."
     try:
         start, stop, count = text.split(":")
         first, last, number = float(start), float(stop), int(count)
-        if number < 1 or not (0 < first <= last) or (number > 1 and first == last):
-            raise ValueError
     except ValueError as error:
-        raise ValueError(f"bands {text!r} is not start:stop:count in nm, such as 420:720:28.") from error
+        raise ValueError(complaint) from error
+    if not 1 <= number <= _MOST_BANDS or not (0 < first <= last) or (number > 1 and first == last):
+        raise ValueError(complaint)
     return wavelength_grid(list(np.linspace(first, last, number) * nm)).numpy()
 
 

@@ -143,7 +143,18 @@ def test_errors_in_words() -> None:
 def test_parse_bands() -> None:
     np.testing.assert_allclose(parse_bands("420:720:28"), np.linspace(420, 720, 28) * nm, rtol=1e-15)
     assert parse_bands("550:550:1").tolist() == [550 * nm]
-    for text in ("420:720", "a:b:c", "720:420:28", "420:720:0", "420:420:2", "-1:3:4", "", "420:720:28:1", "nan:720:3"):
+    for text in (
+        "420:720",
+        "a:b:c",
+        "720:420:28",
+        "420:720:0",
+        "420:420:2",
+        "-1:3:4",
+        "",
+        "420:720:28:1",
+        "nan:720:3",
+        "420:720:9999999999",
+    ):
         with pytest.raises(ValueError, match="start:stop:count"):
             parse_bands(text)
     with pytest.raises(ValueError, match="outside 1e-07"):
