@@ -7,7 +7,9 @@ A reader opens a path as a `Source`, which says the unit, the wavelengths and th
 from __future__ import annotations
 
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -354,9 +356,36 @@ def _mat_arrays(path: Path) -> dict[str, tuple[int, ...]]:
     return {name: shape for name, shape, _ in whosmat(str(path))}
 
 
+_MAT_NUMBERS = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13})
+"""The types that numbers may be stored as; scipy takes any other as a place in memory, and crashes."""
+
+
+def _check_mat_tags(path: Path) -> None:
+    """CubeError where an array of numbers in a MATLAB 5 file says that it is stored as a type that does not exist."""
+    with path.open("rb") as file:
+        order = ">" if file.read(128)[126:128] == b"MI" else "<"
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(order + "II", tag)
+            following = file.tell() + size
+            head = file.read(min(size, 4096))
+            if kind == 15:
+                head = zlib.decompressobj().decompress(head, 4096)[8:]
+            place = 0
+            for part in range(4):  # flags, sizes, name, values: each a tag and its bytes, or both in eight
+                first, count = struct.unpack_from(order + "II", head, place)
+                small = first >> 16
+                if part == 0 and head[8 if order == "<" else 11] not in range(6, 16):
+                    break  # no numbers: cells, structures, text
+                if (first & 0xFFFF if small else first) not in _MAT_NUMBERS:
+                    raise CubeError(f"an array in it is stored as type {first}, which does not exist.")
+                place += 8 if small else 8 + (count + 7) // 8 * 8
+            file.seek(following)
+
+
 def _mat_array(path: Path, name: str) -> np.ndarray:
     from scipy.io import loadmat
 
+    _check_mat_tags(path)
     sizes = _check_size(_mat_arrays(path).get(name, (0,)), f"its {name!r}")
     _check_bomb(int(np.prod(sizes, dtype=np.int64)), path.stat().st_size, f"its {name!r}")  # at a byte a value
     found = loadmat(str(path), variable_names=[name]).get(name)

@@ -505,7 +505,8 @@ def plainly(case: Damaged) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         axes = {"bsq": "bls", "bil": "lbs", "bip": "lsb"}[re.search(r"interleave *= *(\w+)", text)[1].lower()]
         stored = np.fromfile(case.clean.target, order + kind_of).reshape([size[axis] for axis in axes])
         factor = re.search(r"^reflectance scale factor *= *(\S+)", text, re.MULTILINE | re.IGNORECASE)
-        values = stored.transpose([axes.index(axis) for axis in "bls"]) / (float(factor[1]) if factor else 1)
+        with np.errstate(all="ignore"):  # damaged floats
+            values = stored.transpose([axes.index(axis) for axis in "bls"]) / (float(factor[1]) if factor else 1)
         listed = re.search(r"^wavelength *= *\{([^}]*)\}", text, re.MULTILINE)[1]
         grid = np.array([float(value) for value in listed.split(",")])
     elif kind == "tiff":
