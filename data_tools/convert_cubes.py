@@ -41,6 +41,8 @@ def main(
             usage(f"{name} {value} is unknown; known: {', '.join(known)}.")
     if named and wavelengths:
         usage("--profile and --wavelengths say the same thing; give one of them.")
+    if out.exists() and not out.is_dir():
+        usage(f"--out {out} is a file, expected a folder.")
     try:
         grid = profile(named) if named else parse_bands(wavelengths) if wavelengths else None
         target = parse_bands(bands) if bands else None

@@ -24,6 +24,8 @@ def main(
     as_json: Json = False,
 ) -> None:
     """Contact sheet, spectra, bad bands and pixels, dynamic range: pictures and a table."""
+    if out.exists() and not out.is_dir():
+        usage(f"--out {out} is a file, expected a folder.")
     try:
         paths = [path for given in cubes for path in scenes_in(given)]
     except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -64,6 +65,8 @@ def convert(
         try:
             for path in scenes_in(Path(given)):
                 name = scene_name(path)
+                if name in jobs and path.resolve() == jobs[name].resolve():
+                    continue
                 if name in jobs:
                     report.failed[str(path)] = f"another input is called {name} too: {jobs[name]}."
                 else:
@@ -87,14 +90,29 @@ def _run(
         for path in paths:
             yield path, convert_one(path, out, how)
         return
-    with ProcessPoolExecutor(min(workers, len(paths)), mp_context=get_context("spawn")) as pool:
-        running = {pool.submit(convert_one, path, out, how): path for path in paths}
-        for future in as_completed(running):
-            yield running[future], future.result()
+    left = list(paths)
+    while left:  # a library that crashes takes its process along: what was not done is done again, one by one
+        several = left if len(left) == len(paths) else left[:1]
+        with ProcessPoolExecutor(min(workers, len(several)), mp_context=get_context("spawn")) as pool:
+            running = {pool.submit(convert_one, path, out, how): path for path in several}
+            for future in as_completed(running):
+                try:
+                    found = future.result()
+                except BrokenProcessPool:
+                    if len(several) > 1:
+                        continue
+                    found = "reading it crashed the process: it is damaged."
+                left.remove(running[future])
+                yield running[future], found
 
 
 def convert_one(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
-    """One scene: its facts, or why it failed."""
+    """One scene: its facts, or why it failed, in one line."""
+    found = _convert(path, out, how)
+    return " ".join(found.split()) if isinstance(found, str) else found
+
+
+def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
     name = scene_name(path)
     try:
         options = replace(how.options, bands=how.bands)

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from kcam.files import replacing
-from kcam.units import nm, wavelength_grid
+from kcam.units import WAVELENGTH_RANGE, nm, wavelength_grid
 
 SUFFIX = ".tif"
 VERSION = 1
@@ -107,11 +107,19 @@ class Source:
             raise CubeError(f"its header says {bands} x {height} x {width}: no cube has that size.")
         if len(self.wavelengths) != bands:
             raise CubeError(f"it has {bands} bands, but {len(self.wavelengths)} wavelengths.")
+        low, high = WAVELENGTH_RANGE
+        outside = [value for value in self.wavelengths if not low <= value <= high]
+        if outside:
+            raise CubeError(f"it says a wavelength of {outside[0] / nm:g} nm, outside {low / nm:g}..{high / nm:g} nm.")
+        if len(np.unique(self.wavelengths)) != bands:
+            raise CubeError("two of its bands have the same wavelength.")
         return self
 
     def cube(self) -> Cube:
         """All of it, in memory."""
         values, valid = self.checked_rows(0, self.shape[1])
+        if valid is not None and not valid.any():
+            raise CubeError("it holds no valid pixel: all are NaN, infinite or marked as invalid.")
         mask = None
         if valid is not None or (self.extrapolated is not None and self.extrapolated.any()):
             pixels = np.ones(self.shape[1:], bool) if valid is None else valid
@@ -122,19 +130,26 @@ class Source:
         return Cube(torch.from_numpy(values), grid, self.unit, mask, depth, self.name, self.facts)
 
     def checked_rows(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """`rows`, with pixels that are not finite marked and set to 0. CubeError where none of many is valid."""
-        values, valid = self.rows(first, last)
-        values = np.ascontiguousarray(values, dtype=np.float32)
+        """`rows`, with pixels that are not finite marked, and set to 0 with those that are not valid.
+
+        Raises:    CubeError where they cannot be read.
+        """
+        try:
+            with np.errstate(all="ignore"):  # what overflows float32 is infinite, and marked
+                values, valid = self.rows(first, last)
+                values = np.ascontiguousarray(values, dtype=np.float32)
+        except (CubeError, ImportError):
+            raise
+        except MemoryError as error:
+            raise CubeError("it does not fit into memory.") from error
+        except Exception as error:
+            reason = (str(error).strip().splitlines() or [""])[0][:200]
+            raise CubeError(f"rows {first} to {last} cannot be read: {type(error).__name__}: {reason}") from error
         finite = np.isfinite(values).all(0)
-        if not finite.all():
-            valid = finite if valid is None else valid & finite
-            if not finite.any():
-                raise CubeError(f"rows {first} to {last} hold nothing but NaN or infinity.")
-        if valid is not None:
-            values[:, ~valid] = 0
-            if valid.all():
-                valid = None
-        return values, valid
+        valid = finite if valid is None else valid & finite
+        if valid.all():
+            return values, None
+        return np.where(valid, values, np.float32(0)), valid  # not in place: the rows may be the caller's own
 
 
 def write_cube(path: str | os.PathLike[str], cube: Cube) -> None:
@@ -166,8 +181,8 @@ def write_cube(path: str | os.PathLike[str], cube: Cube) -> None:
     )
 
 
-STRIP = 2**25
-"""Values that are held at once: 128 MB."""
+STRIP = 2**24
+"""Values of a cube that are held at once: 64 MB, some three times over."""
 
 
 def write_source(path: str | os.PathLike[str], source: Source) -> dict[str, Any]:
@@ -192,18 +207,23 @@ def write_source(path: str | os.PathLike[str], source: Source) -> dict[str, Any]
     with replacing(path) as temporary:
         text = json.dumps(document, sort_keys=True)
         large = 4 * bands * height * width > 2**32 - 2**26
-        values = tifffile.memmap(
-            temporary, shape=source.shape, dtype=np.float32, description=text, bigtiff=large, **how
+        made = tifffile.memmap(
+            temporary, shape=source.shape, dtype=np.float32, description=text, bigtiff=large, byteorder="<", **how
         )
-        for first in range(0, height, strip):
-            last = min(first + strip, height)
-            part, valid = source.checked_rows(first, last)
-            values[:, first:last] = part
-            if valid is not None:
-                invalid[first:last] = ~valid
-            low, high = min(low, float(part.min())), max(high, float(part.max()))
-        values.flush()
-        del values
+        start = made.offset
+        del made
+        with temporary.open("rb+") as file:  # through the mapping, all that was written would stay in memory
+            for first in range(0, height, strip):
+                last = min(first + strip, height)
+                part, valid = source.checked_rows(first, last)
+                for band, plane in enumerate(part.astype("<f4", copy=False)):
+                    file.seek(start + 4 * width * (band * height + first))
+                    file.write(plane.tobytes())
+                if valid is not None:
+                    invalid[first:last] = ~valid
+                low, high = min(low, float(part.min())), max(high, float(part.max()))
+        if invalid.all():
+            raise CubeError("it holds no valid pixel: all are NaN, infinite or marked as invalid.")
         with tifffile.TiffWriter(temporary, append=True) as file:
             if invalid.any():
                 file.write((~invalid).astype(np.uint8) * 255, **how)
@@ -249,6 +269,12 @@ def open_cube(path: Path) -> Source:
         if not bands <= len(pages) <= bands + 2 or len(extrapolated) != bands or unit not in UNITS:
             raise CubeError(f"it has {len(pages)} pages and {len(extrapolated)} marks for {bands} bands of {unit!r}.")
         places = [_place(page, index, (height, width), file) for index, page in enumerate(pages)]
+    kinds = [dtype.kind for _, dtype in places]
+    if "u" in kinds[:bands] or len(set(kinds[bands:])) != len(kinds[bands:]):
+        raise CubeError("its pages are not as kcam writes them: values, then one mask at most and one depth map.")
+    size = 4 * height * width
+    if any(start != places[0][0] + index * size for index, (start, _) in enumerate(places[:bands])):
+        raise CubeError("its bands do not follow one another: a header is damaged, or another tool wrote it anew.")
 
     def page_rows(index: int, first: int, last: int) -> np.ndarray:
         start, dtype = places[index]
@@ -273,6 +299,8 @@ def _place(page: Any, index: int, shape: tuple[int, int], file: tifffile.TiffFil
     dtype = np.dtype(page.dtype).newbyteorder(file.byteorder)
     if page.shape != shape or dtype.kind + str(dtype.itemsize) not in ("f4", "u1") or page.compression != 1:
         raise CubeError(f"page {index} is {page.shape} of {page.dtype}, not as kcam writes it.")
-    if not page.is_contiguous or page.dataoffsets[0] + page.nbytes > file.filehandle.size:
+    if not page.is_contiguous or sum(page.databytecounts) != page.nbytes:
+        raise CubeError(f"page {index} is not in one piece: its header is damaged.")
+    if page.dataoffsets[0] + page.nbytes > file.filehandle.size:
         raise CubeError(f"page {index} is cut off: the file ends before it does.")
     return page.dataoffsets[0], dtype

@@ -65,9 +65,7 @@ def export_patches(
 
 
 @contextmanager
-def _hdf5(
-    path: Path, shape: tuple[int, ...], tables: dict[str, np.ndarray], document: dict[str, Any]
-) -> Iterator[Any]:
+def _hdf5(path: Path, shape: tuple[int, ...], tables: dict[str, np.ndarray], document: dict[str, Any]) -> Iterator[Any]:
     try:
         import h5py
     except ImportError as error:
@@ -81,9 +79,7 @@ def _hdf5(
 
 
 @contextmanager
-def _zarr(
-    path: Path, shape: tuple[int, ...], tables: dict[str, np.ndarray], document: dict[str, Any]
-) -> Iterator[Any]:
+def _zarr(path: Path, shape: tuple[int, ...], tables: dict[str, np.ndarray], document: dict[str, Any]) -> Iterator[Any]:
     try:
         import zarr
     except ImportError as error:

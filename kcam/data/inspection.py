@@ -92,11 +92,11 @@ def inspect(path: Path) -> tuple[Findings, Tensor, np.ndarray]:
         top=top,
         stops=float(np.log2(max(float(percentiles[4]), floor) / floor)),
         negative=float((inside < 0).mean()),
-        clipped=float((inside >= top).mean()) if inside.size > 1 else 0.0,
+        clipped=_clipped(inside, top),
         invalid=float(1 - valid.mean()),
         noise=noise / max(float(percentiles[2]), 1e-9),
         bad_bands=tuple(_bad_bands(inside)),
-        bad_pixels=_hot(inside),
+        bad_pixels=_hot(values, valid),
         extrapolated=() if source.extrapolated is None else tuple(np.flatnonzero(source.extrapolated).tolist()),
         spectrum=tuple(inside.mean(1).tolist()),
     )
@@ -123,20 +123,35 @@ def _noise(values: np.ndarray, valid: np.ndarray) -> float:
     return 1.4826 * float(np.median([np.median(np.abs(difference)) for difference in differences]))
 
 
-def _hot(values: np.ndarray) -> float:
-    """Share of values far from the mean of the bands beside them, where spectra are smooth: hot and dead pixels."""
-    if len(values) < 3:
+def _clipped(values: np.ndarray, top: float) -> float:
+    """Share of values at the top, if several bands share it: a flat white has a top of its own in each band."""
+    full = values >= top
+    return float(full.mean()) if full.any(1).sum() > 1 else 0.0
+
+
+def _hot(values: np.ndarray, valid: np.ndarray) -> float:
+    """Share of values far from the mean of the bands beside them, alone in their surroundings: hot and dead pixels."""
+    import cv2
+
+    if len(values) < 3 or min(values.shape[1:]) < 3 or not valid.any():
         return 0.0
     residual = values[1:-1] - (values[:-2] + values[2:]) / 2
-    deviation = 1.4826 * np.median(np.abs(residual - np.median(residual, axis=1, keepdims=True)), axis=1)
-    level = np.maximum(_HOT * deviation, 0.2 * np.abs(values).mean())[:, None]
-    beside = np.maximum(np.abs(values[1:-1]), (np.abs(values[:-2]) + np.abs(values[2:])) / 2)
-    return float((np.abs(residual) > np.maximum(level, 0.5 * beside)).mean())
+    mean = np.abs(values[:, valid]).mean()
+    size = np.pad(np.abs(residual), ((1, 1), (0, 0), (0, 0)))
+    hot = 0
+    for band, plane in enumerate(residual):
+        alone = plane - cv2.medianBlur(np.ascontiguousarray(plane), 3)  # a steep spectrum is so in pixels around it too
+        deviation = 1.4826 * np.median(np.abs(plane[valid] - np.median(plane[valid])))
+        beside = np.maximum(np.abs(values[band + 1]), (np.abs(values[band]) + np.abs(values[band + 2])) / 2)
+        found = np.minimum(size[band + 1], np.abs(alone)) > np.maximum(max(_HOT * deviation, 0.2 * mean), 0.5 * beside)
+        found &= (size[band + 1] >= size[band]) & (size[band + 1] >= size[band + 2])  # its neighbours look half as bad
+        hot += int(found[valid].sum())
+    return hot / (len(residual) * int(valid.sum()))
 
 
 def _bad_bands(values: np.ndarray) -> list[int]:
     """Bands that are constant while their neighbours are not, or hardly correlate with them."""
-    spread = values.std(1)
+    spread = np.ptp(values, axis=1)  # a deviation of float32 is not 0 where all values are equal
     bad = []
     for band in range(len(values)):
         beside = [other for other in (band - 1, band + 1) if 0 <= other < len(values) and spread[other] > 0]

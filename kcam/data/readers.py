@@ -7,7 +7,9 @@ A reader opens a path as a `Source`, which says the unit, the wavelengths and th
 from __future__ import annotations
 
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -95,6 +97,8 @@ def open_source(path: Path, *, format: str | None = None, options: Options | Non
     """A cube that is read strip by strip. Errors as `read_cube`."""
     if not path.exists():
         raise FileNotFoundError(f"there is no file or folder {path}.")
+    if not (path.is_file() or path.is_dir()):
+        raise CubeError("it is neither a file nor a folder.")
     row = None if format is None else FORMATS.get(format)
     if format is not None and row is None:
         raise ValueError(f"unknown format {format!r}; known: {', '.join(FORMATS)}.")
@@ -102,10 +106,11 @@ def open_source(path: Path, *, format: str | None = None, options: Options | Non
     if row is None:
         raise CubeError(
             f"its format is not recognised. Name it: --format {'|'.join(FORMATS)}, and --profile or --wavelengths for "
-            "files that hold no wavelengths."
+            "files that hold no wavelengths. Or it is damaged."
         )
     try:
-        source = row.open(path, options or Options())
+        with np.errstate(all="ignore"):  # what overflows float32 is infinite, and marked when it is read
+            source = row.open(path, options or Options())
         return replace(source, facts={"format": row.name} | row.facts | source.facts).check()
     except (CubeError, ImportError, FileNotFoundError):
         raise
@@ -121,13 +126,18 @@ def recognised(path: Path) -> Format | None:
         try:
             if row.matches(path):
                 return row
-        except (OSError, ValueError):
+        except ImportError:
+            raise
+        except Exception:  # whatever a damaged file makes a library raise
             continue
     return None
 
 
 def scenes_in(path: Path) -> Iterator[Path]:
-    """The scenes of a path: itself, or what a folder of scenes holds, sorted; folders of one scene are not entered."""
+    """The scenes of a path: itself, or what a folder of scenes holds, sorted; folders of one scene are not entered.
+
+    A link to a folder that the path itself lies in is passed over.
+    """
     if path.is_file() or (path.is_dir() and _cave_files(path)):
         yield path
         return
@@ -137,6 +147,8 @@ def scenes_in(path: Path) -> Iterator[Path]:
         if child.name.startswith(".") or child.name in ("__MACOSX", "Thumbs.db", "calib.txt"):
             continue
         if child.is_dir():
+            if child.is_symlink() and child.resolve() in (path.resolve(), *path.resolve().parents):
+                continue
             yield from scenes_in(child)
         elif child.suffix.lower() in SUFFIXES:
             yield child
@@ -149,6 +161,15 @@ def scene_name(path: Path) -> str:
 
 
 # ---- what readers share --------------------------------------------------------------------------------------------
+
+
+_SLACK = 2**26  # bytes that a header may promise in any case
+
+
+def _check_bomb(promised: int, stored: int, what: str = "its header") -> None:
+    """CubeError where a header promises far more than its bytes can hold: no picture compresses to a 64th."""
+    if promised > 64 * stored + _SLACK:
+        raise CubeError(f"{what} promises {promised / 1e6:.0f} MB in {stored / 1e6:.3g} MB of data: it is damaged.")
 
 
 def _first_line(error: Exception) -> str:
@@ -208,25 +229,44 @@ def _scaled(values: np.ndarray, divisor: float, clip: bool = False) -> np.ndarra
 def _open_kaist(path: Path, options: Options) -> Source:
     """KAIST (Choi et al. 2017): one scanline EXR, channels w420nm ... w720nm; reflectance against Spectralon."""
     try:
+        import Imath
         import OpenEXR
     except ImportError as error:
         raise ImportError("KAIST's files are OpenEXR, which the extra reads: pip install 'kcam[exr]'.") from error
-    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
-        if len(header.parts) != 1:
-            raise CubeError(f"it has {len(header.parts)} parts, expected one: it may be cut off.")
-        names = list(header.channels())
-        (left, top), (right, bottom) = header.header()["dataWindow"]
-    _check_size((len(names), bottom - top + 1, right - left + 1), "its data window")
-    found = sorted((float(m[1]), name) for name in names if (m := re.fullmatch(r"w([\d.]+)nm", name)))
-    if not found:
-        raise CubeError(f"it has no channels such as w420nm, only {', '.join(names[:6])}.")
-    with OpenEXR.File(str(path), separate_channels=True) as file:
+    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:  # InputFile.header() can crash
         if len(file.parts) != 1:
-            raise CubeError("its pixels are cut off or damaged.")
-        channels = file.channels()
-        values = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for _, name in found])
-    grid = _nanometres([wavelength for wavelength, _ in found])
-    return Source(scene_name(path), values.shape, grid, "reflectance", _whole(values), {"scaling": "as stored"})
+            raise CubeError(f"it has {len(file.parts)} parts, expected one.")
+        channels = [(channel.name, channel.xSampling, channel.ySampling) for channel in file.header()["channels"]]
+        (left, top), (right, bottom) = ((int(x), int(y)) for x, y in file.header()["dataWindow"])
+    names = [name for name, _, _ in channels]
+    if any(steps != [1, 1] for _, *steps in channels):
+        raise CubeError("some of its channels have fewer pixels than others.")
+    height, width = bottom - top + 1, right - left + 1
+    _check_size((len(names), height, width), "its data window")
+    found = {name: float(match[1]) for name in names if (match := re.fullmatch(r"w(\d+(?:\.\d+)?)nm", name))}
+    strange = sorted(set(names) - set(found) - set("RGBAYZ"))
+    if not found or strange:
+        raise CubeError(f"its channels are no wavelengths such as w420nm: {', '.join((strange or names)[:6])}.")
+    _check_bomb(2 * len(found) * height * width, path.stat().st_size)
+    ordered = sorted(found, key=found.__getitem__)
+    grid = _nanometres([found[name] for name in ordered])
+    pixel_type = Imath.PixelType(Imath.PixelType.FLOAT)
+
+    def rows(first: int, last: int) -> tuple[np.ndarray, None]:
+        file = OpenEXR.InputFile(str(path))
+        try:
+            if not file.isComplete():
+                raise CubeError("it is cut off: lines are missing.")
+            lines = file.channels(ordered, pixel_type, top + first, top + last - 1)
+        finally:
+            file.close()
+        values = np.empty((len(ordered), last - first, width), np.float32)
+        for plane, pixels in zip(values, lines, strict=True):
+            plane[:] = np.frombuffer(pixels, np.float32).reshape(plane.shape)
+        return values, None
+
+    facts = {"scaling": "as stored", "orientation": "as stored"}
+    return Source(scene_name(path), (len(ordered), height, width), grid, "reflectance", rows, facts)
 
 
 # ---- MATLAB: ICVL, ARAD-1K, Harvard, CASSI -------------------------------------------------------------------------
@@ -259,12 +299,22 @@ def _open_hdf5(
     """An HDF5 array with wavelengths beside it; `axes` brings it to (L,H,W)."""
     h5py = _h5py()
     with h5py.File(path, "r") as file:
+        for name in (key, "bands"):
+            link = file.get(name, getlink=True)
+            if link is not None and not isinstance(link, h5py.HardLink):
+                raise CubeError(f"its {name!r} is a link to elsewhere, which is not followed.")
         if key not in file:
             raise CubeError(f"it has no array {key!r}, only {', '.join(sorted(file)) or 'nothing'}.")
         array = file[key]
         if not isinstance(array, h5py.Dataset) or array.ndim != 3 or array.dtype.kind not in "fui":
             raise CubeError(f"its {key!r} is no array of numbers with three axes.")
+        if array.external or array.is_virtual:
+            raise CubeError(f"its {key!r} lies in other files, which are not opened.")
         sizes = _check_size(array.shape, f"its {key!r}")
+        stored = array.id.get_storage_size()
+        if not 0 < stored <= path.stat().st_size:
+            raise CubeError(f"its {key!r} is not in the file: {stored} bytes of {path.stat().st_size}.")
+        _check_bomb(array.nbytes, stored, f"its {key!r}")
         bands = None
         if "bands" in file and isinstance(file["bands"], h5py.Dataset) and file["bands"].size <= 10_000:
             bands = _nanometres(file["bands"][()])
@@ -306,10 +356,38 @@ def _mat_arrays(path: Path) -> dict[str, tuple[int, ...]]:
     return {name: shape for name, shape, _ in whosmat(str(path))}
 
 
+_MAT_NUMBERS = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13})
+"""The types that numbers may be stored as; scipy takes any other as a place in memory, and crashes."""
+
+
+def _check_mat_tags(path: Path) -> None:
+    """CubeError where an array of numbers in a MATLAB 5 file says that it is stored as a type that does not exist."""
+    with path.open("rb") as file:
+        order = ">" if file.read(128)[126:128] == b"MI" else "<"
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(order + "II", tag)
+            following = file.tell() + size
+            head = file.read(min(size, 4096))
+            if kind == 15:
+                head = zlib.decompressobj().decompress(head, 4096)[8:]
+            place = 0
+            for part in range(4):  # flags, sizes, name, values: each a tag and its bytes, or both in eight
+                first, count = struct.unpack_from(order + "II", head, place)
+                small = first >> 16
+                if part == 0 and head[8 if order == "<" else 11] not in range(6, 16):
+                    break  # no numbers: cells, structures, text
+                if (first & 0xFFFF if small else first) not in _MAT_NUMBERS:
+                    raise CubeError(f"an array in it is stored as type {first}, which does not exist.")
+                place += 8 if small else 8 + (count + 7) // 8 * 8
+            file.seek(following)
+
+
 def _mat_array(path: Path, name: str) -> np.ndarray:
     from scipy.io import loadmat
 
-    _check_size(_mat_arrays(path).get(name, (0,)), f"its {name!r}")
+    _check_mat_tags(path)
+    sizes = _check_size(_mat_arrays(path).get(name, (0,)), f"its {name!r}")
+    _check_bomb(int(np.prod(sizes, dtype=np.int64)), path.stat().st_size, f"its {name!r}")  # at a byte a value
     found = loadmat(str(path), variable_names=[name]).get(name)
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fui":
         raise CubeError(f"its {name!r} is no array of numbers.")
@@ -383,7 +461,7 @@ def _cave_files(path: Path) -> list[tuple[int, Path]]:
         found = []
         for file in folder.iterdir():
             match = re.fullmatch(r".*_ms_(\d+)\.png", file.name, re.IGNORECASE)
-            if match and not file.name.startswith("."):
+            if match and not file.name.startswith(".") and file.is_file():
                 found.append((int(match[1]), file))
         if found:
             return sorted(found)
@@ -398,7 +476,8 @@ def _read_png(path: Path) -> np.ndarray:
         head = file.read(24)
     if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
         raise CubeError(f"{path.name} is no PNG.")
-    _check_size((int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")), path.name)
+    width, height = _check_size((int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")), path.name)
+    _check_bomb(2 * width * height, path.stat().st_size, path.name)
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise CubeError(f"{path.name} is damaged.")
@@ -418,10 +497,11 @@ def _open_cave(path: Path, options: Options) -> Source:
     if not files:
         raise CubeError("it holds no bands such as X_ms_01.png.")
     numbers = [number for number, _ in files]
-    if numbers != list(range(1, len(numbers) + 1)):
-        missing = sorted(set(range(1, 32)) - set(numbers))
-        raise CubeError(f"bands {', '.join(map(str, missing)) or 'are repeated or beyond 31'} are missing.")
-    grid = _known(path, options, len(files), PROFILES["cave31"] * nm if len(files) == 31 else None)
+    count = 31 if options.wavelengths is None else len(options.wavelengths)
+    if numbers != list(range(1, count + 1)):
+        missing = ", ".join(str(number) for number in range(1, count + 1) if number not in numbers)
+        raise CubeError(f"bands missing: {missing}." if missing else f"it has {len(numbers)} PNGs for {count} bands.")
+    grid = _known(path, options, len(files), PROFILES["cave31"] * nm)
     planes = [_read_png(file) for _, file in files]
     if len({plane.shape for plane in planes}) != 1:
         raise CubeError("its bands have different sizes.")
@@ -440,8 +520,20 @@ def _envi_header(path: Path) -> dict[str, str]:
     text = path.read_text(errors="replace")
     if not text.lstrip().startswith("ENVI"):
         raise CubeError("its header does not begin with ENVI.")
-    fields = re.findall(r"^\s*([^=\n{}]+?)\s*=\s*(\{[^}]*\}|[^\n]*)", text, re.MULTILINE)
+    fields = re.findall(r"^[ \t]*([^=\n{};]+?)[ \t]*=[ \t]*(\{[^}]*\}|[^\n]*)", text, re.MULTILINE)
     return {name.strip().lower(): value.strip() for name, value in fields}
+
+
+_ENVI_UNITS = {"nanometer": nm, "nm": nm, "micrometer": 1e-6, "micron": 1e-6, "um": 1e-6, "angstrom": 1e-10}
+
+
+def _envi_grid(listed: np.ndarray, unit: str) -> np.ndarray:
+    if unit in ("", "unknown"):
+        return _nanometres(listed)
+    scale = _ENVI_UNITS.get(unit.replace("metre", "meter").removesuffix("s"))
+    if scale is None:
+        raise CubeError(f"its wavelengths are in {unit!r}, not in nm or um. Say them: --wavelengths.")
+    return listed * scale
 
 
 def _open_envi(path: Path, options: Options) -> Source:
@@ -465,16 +557,18 @@ def _open_envi(path: Path, options: Options) -> Source:
     if raw is None:
         raise CubeError(f"there are no values beside {header_path.name}.")
     dtype = np.dtype(kind).newbyteorder(">" if order else "<")
-    if offset < 0 or raw.stat().st_size < offset + bands * height * width * dtype.itemsize:
-        raise CubeError(f"{raw.name} is cut off: its header says {bands} x {height} x {width} of {dtype}.")
+    wanted = offset + bands * height * width * dtype.itemsize
+    if offset < 0 or raw.stat().st_size != wanted:
+        raise CubeError(
+            f"{raw.name} has {raw.stat().st_size} bytes, its header says {wanted}: {bands} x {height} x {width} of "
+            f"{dtype} behind {offset} bytes."
+        )
     sizes = {"bsq": (bands, height, width), "bil": (height, bands, width), "bip": (height, width, bands)}[interleave]
     values = np.memmap(raw, dtype, "r", offset, sizes).transpose(axes)
     grid = None
     if "wavelength" in header:
-        listed = [float(value) for value in re.findall(r"[\d.eE+-]+", header["wavelength"])]
-        unit = header.get("wavelength units", "").lower()
-        grid = np.asarray(listed) * (1e-6 if unit.startswith("micro") or unit == "um" else nm)
-        grid = grid if unit else _nanometres(listed)
+        listed = np.asarray([float(value) for value in header["wavelength"].strip("{} \n\t,").split(",")])
+        grid = _envi_grid(listed, header.get("wavelength units", "").lower())
     divisor = float(header.get("reflectance scale factor", 1) or 1)
     if not divisor > 0:
         raise CubeError(f"its reflectance scale factor is {divisor:g}, expected more than 0.")
@@ -509,8 +603,13 @@ def _open_tiff(path: Path, options: Options) -> Source:
         series = file.series[0]
         sizes = _check_size(series.shape, "its first series")
         wanted = sum(page.nbytes for page in series.pages if page is not None)
-        if wanted > 64 * max(file.filehandle.size, 1) + 2**20:
-            raise CubeError(f"it says {wanted / 1e6:.0f} MB in a file of {file.filehandle.size / 1e6:.3g} MB.")
+        _check_bomb(wanted, file.filehandle.size)
+        if len(file.series) > 1:
+            raise CubeError(f"its pages are of {len(file.series)} kinds, expected one size and type.")
+        for index, page in enumerate(file.pages):
+            ends = [at + count for at, count in zip(page.dataoffsets, page.databytecounts, strict=True)]
+            if not ends or min(page.databytecounts) < 1 or max(ends) > file.filehandle.size:
+                raise CubeError(f"page {index} is cut off: the file ends before it does.")
         values = series.asarray()
         names = series.axes
     if values.ndim == 2:
@@ -558,24 +657,23 @@ def _open_npz(path: Path, options: Options) -> Source:
                         else (np.lib.format.read_array_header_2_0)
                     )
                     shape, _, dtype = reader(file)
-                heads[member.filename.removesuffix(".npy")] = (shape, dtype, member.file_size)
+                heads[member.filename.removesuffix(".npy")] = (shape, dtype, member)
     key = options.key or next((name for name in _NPZ_KEYS if name in heads and len(heads[name][0]) == 3), None)
     if key is None or key not in heads:
         raise CubeError(
             f"it has no array {' or '.join(_NPZ_KEYS)} of three axes, only {', '.join(heads) or 'nothing'}."
         )
-    shape, dtype, stored = heads[key]
+    shape, dtype, member = heads[key]
     if dtype.hasobject or dtype.kind not in "fui" or len(shape) != 3:
         raise CubeError(f"its {key!r} is {shape} of {dtype}, expected numbers with three axes.")
     _check_size(shape, f"its {key!r}")
-    if stored < np.prod(shape, dtype=np.int64) * dtype.itemsize:
-        raise CubeError(f"its {key!r} is cut off.")
-    with np.load(path, allow_pickle=False) as content:
-        values = content[key]
-        own = None
+    _check_bomb(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, path.stat().st_size, f"its {key!r}")
+    own = None
+    with zipfile.ZipFile(path) as archive:
+        values = _npy(archive, member)
         if "wavelengths" in heads and np.prod(heads["wavelengths"][0], dtype=np.int64) <= 10_000:
-            own = np.asarray(content["wavelengths"], dtype=np.float64).ravel()
-            own = own if own.max(initial=1) < 1e-3 else _nanometres(own)
+            own = _npy(archive, heads["wavelengths"][2]).astype(np.float64).ravel()
+            own = own if 0 < own.max(initial=0) < 1e-3 else _nanometres(own)
     grid = own if options.wavelengths is None else options.wavelengths
     if grid is not None and values.shape[0] != len(grid) and values.shape[2] == len(grid):
         values = values.transpose(2, 0, 1)
@@ -583,6 +681,15 @@ def _open_npz(path: Path, options: Options) -> Source:
     grid = _known(path, options, len(values), own)
     facts = {"scaling": f"{key} / {divisor:g}", "orientation": "as stored"}
     return Source(scene_name(path), values.shape, grid, "relative radiance", _whole(_scaled(values, divisor)), facts)
+
+
+def _npy(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """An array of a zip; its checksum is compared where the member ends, so it is read to there."""
+    with archive.open(member) as file:
+        values = np.lib.format.read_array(file, allow_pickle=False)
+        if file.read(1):
+            raise CubeError(f"{member.filename} goes on after its array.")
+    return values
 
 
 # ---- photographs ---------------------------------------------------------------------------------------------------
@@ -618,15 +725,14 @@ def resampled(source: Source, target: np.ndarray, *, method: str = "pchip", edge
         found = resampling(source.wavelengths, target, method=method, edge=edge)
     except ValueError as error:
         raise CubeError(str(error)) from error
-    matrix = found.matrix.astype(np.float32)
 
     def rows(first: int, last: int) -> tuple[np.ndarray, np.ndarray | None]:
         values, valid = source.checked_rows(first, last)
-        return np.einsum("ts,shw->thw", matrix, values, optimize=True), valid
+        return found.apply(values), valid
 
     guessed = found.extrapolated
     if source.extrapolated is not None:  # a band that leans on a guess is one
-        guessed = guessed | (matrix[:, source.extrapolated] != 0).any(1)
+        guessed = guessed | (found.matrix[:, source.extrapolated] != 0).any(1)
     facts = {**source.facts, "resampled": f"{method} from {len(source.wavelengths)} bands"}
     shape = (len(target), *source.shape[1:])
     return replace(source, shape=shape, wavelengths=target, rows=rows, facts=facts, extrapolated=guessed)
