@@ -58,10 +58,10 @@ def resampling(source: np.ndarray, target: np.ndarray, *, method: str = "pchip",
     (`COARSER`) it is averaged over the width of the target's band, half-way to its neighbours.
 
     Args:      source: (S,), target: (T,) [m], in any order, no two of the source equal.
-               method: "pchip", piecewise cubic Hermite polynomials through the bands with the slopes of parabolas through
-               three of them; where `apply` would get less than 0 from values that are not, it gives 0. (The limiter
-               of Fritsch and Carlson, which some mean by this name, depends on the data: it is no matrix.) "cubic":
-               a spline, twice as accurate on smooth spectra, left to overshoot.
+               method: "pchip", piecewise cubic Hermite polynomials through the bands, with the slopes of parabolas
+               through three of them; where `apply` would get less than 0 from values that are not, it gives 0. (The
+               limiter of Fritsch and Carlson, which some mean by this name, depends on the data: it is no matrix.)
+               "cubic": a spline, three times as accurate on smooth spectra, left to overshoot.
                edge: what to do with bands beyond the source's ends (by more than 0.1 nm): "error", or "hold" the last
                value and mark them.
     Raises:    ValueError for a grid with equal wavelengths, an unknown method or edge, or bands that would be

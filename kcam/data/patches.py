@@ -289,10 +289,12 @@ def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, 
 
 def _brightest(source: Source, strip: int) -> np.float32:
     """The largest valid value: what 65535 stands for."""
-    high = np.float32(0)
+    high, any_valid = np.float32(0), False
     for first in range(0, source.shape[1], strip):
-        values, _ = source.checked_rows(first, min(first + strip, source.shape[1]))
-        high = max(high, values.max())
+        values, valid = source.checked_rows(first, min(first + strip, source.shape[1]))
+        high, any_valid = max(high, values.max()), any_valid or valid is None or bool(valid.any())
+    if not any_valid:
+        raise CubeError("it holds no valid pixel: nothing but NaN, infinity, or what its mask rules out.")
     if not high > 1e-30:  # below, 65535 / high leaves float32
         raise CubeError("it is black: no value is above 0.")
     return np.float32(high)

@@ -499,7 +499,7 @@ def test_a_disk_that_cannot_be_read_fails_the_scene_alone(cubes: Path, tmp_path:
         return replace(source, rows=rows) if path.stem == "cat" else source
 
     monkeypatch.setattr(patches, "open_cube", broken)
-    assert "failed: cat: OSError: Input/output error" in extract_tool(cubes, tmp_path / "out", status=1)
+    assert "failed: cat: rows 0 to 16 cannot be read: OSError: " in extract_tool(cubes, tmp_path / "out", status=1)
 
 
 class Futures:
