@@ -11,13 +11,30 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 ALL_DONE, SOME_FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 err = Console(stderr=True)
 
 Json = Annotated[bool, typer.Option("--json", help="print the result as JSON, for scripts")]
 Workers = Annotated[int, typer.Option("--workers", min=1, help="processes")]
+
+
+class _Rate(ProgressColumn):
+    """Scenes per second."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:.2g}/s" if task.speed else "")
 
 
 @contextmanager
@@ -27,6 +44,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[str, int], None]]:
         TextColumn(what),
         BarColumn(),
         MofNCompleteColumn(),
+        _Rate(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),

@@ -374,8 +374,9 @@ def extract(
         if finished["plan"] != plan.hash:
             raise StoreError(f"{out} holds a store of other cubes or settings. Use another folder.")
         shutil.rmtree(work, ignore_errors=True)  # empty, where a run was killed in its last moment
-        missing = dict.fromkeys(finished["failed"], "it failed when the store was made.")
-        outcome.finished, outcome.found, outcome.failed = True, True, missing | outcome.failed
+        missing = sorted({*finished["failed"], *plan.failed})
+        outcome.finished, outcome.found, outcome.failed = True, True, {}
+        outcome.warnings = [f"{name} is not in it: it failed when the store was made." for name in missing]
         outcome.skipped = [job.name for job in plan.scenes if job.name not in missing]
         return outcome
     _check_folder(plan, out, goes_on=resume or shard is not None)
