@@ -12,7 +12,7 @@ import kornia.augmentation as K
 import numpy as np
 import pytest
 import torch
-from cases import BY_NAME, CASES, LENS, SIZE, Case, Pictures, picture, pipeline
+from augmented_cases import BY_NAME, CASES, LENS, SIZE, Case, Pictures, picture, pipeline
 from PIL import Image
 from torch import Tensor, nn
 from torch.utils.data import DataLoader

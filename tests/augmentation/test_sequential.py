@@ -9,7 +9,7 @@ from typing import Any
 import kornia.augmentation as K
 import pytest
 import torch
-from cases import BY_NAME, LENS, SIZE, picture
+from augmented_cases import BY_NAME, LENS, SIZE, picture
 from torch import Tensor, nn
 
 import kcam.augmentation as KC
