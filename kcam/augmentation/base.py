@@ -8,6 +8,7 @@ Y = 1, as in `Scene.from_bands`: about 1 in each band, not 1.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -78,14 +79,14 @@ def check_probability(p: float) -> None:
         raise ValueError(f"p must be a probability from 0 to 1, got {p:g}.")
 
 
-def check_values(signal: Tensor) -> None:
+def check_values(signal: Tensor, *, picture: bool) -> None:
     """ValueError for NaN or infinity, which a blur would spread over all, and for a picture of 0..255."""
     if torch.compiler.is_compiling():
         return
     low, high = (float(value) for value in signal.detach().aminmax())
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(f"the input has values from {low:g} to {high:g}, expected finite ones. Remove NaN and inf.")
-    if is_picture(signal) and high > _LARGEST:
+    if picture and high > _LARGEST:
         raise ValueError(
             f"the picture has values up to {high:g}, expected sRGB in [0,1]. Use image / "
             f"{255 if high < 256 else 65535}."
@@ -127,7 +128,8 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         self, input: Tensor, params: dict[str, Any], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Kornia's hook: the rows that were drawn through `simulate`."""
-        return self.on_drawn_rows(input, params, self._simulated)
+        linear = "linear" in params  # from `CameraSequential`, between a colour filter and a tone curve
+        return self.on_drawn_rows(input, params, functools.partial(self._simulated, linear=linear))
 
     def on_drawn_rows(
         self, input: Tensor, params: dict[str, Any], function: Callable[[Tensor, dict[str, Tensor]], Tensor]
@@ -167,10 +169,10 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
             drawn["inverse_depth"] = params["inverse_depth"]
         return drawn
 
-    def _simulated(self, input: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    def _simulated(self, input: Tensor, drawn: dict[str, Tensor], *, linear: bool) -> Tensor:
         working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-        check_values(working)
+        check_values(working, picture=is_picture(working) and not linear)
         with full_precision(input.device):
-            coded = self.in_light and is_picture(working)
+            coded = self.in_light and is_picture(working) and not linear
             result = self.simulate(to_light(working) if coded else working, drawn)
             return (tone_curve(result) if coded else result).to(input.dtype)

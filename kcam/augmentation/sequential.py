@@ -17,10 +17,11 @@ from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from torch import Tensor, nn
 
-from kcam.augmentation.base import wavelengths_of
+from kcam.augmentation.base import CameraAugmentation, wavelengths_of
 from kcam.augmentation.optics import check_inverse_depth
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context, Stage
+from kcam.isp import ToneCurve
 from kcam.optics import Imaging
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, Mosaic
@@ -34,7 +35,8 @@ class CameraSequential(K.AugmentationSequential):
     """`K.AugmentationSequential` in which camera stages may stand, channels may change, and stages see depth.
 
     - Plain kcam stages (`optics.Imaging`, `sensor.Mosaic`, ...) are told of each other as in a `Camera`: a Demosaic
-      knows the pattern of the Mosaic before it, and a contradiction is an error when the container is built.
+      knows the pattern of the Mosaic before it, and a contradiction is an error when the container is built. Our
+      augmentations between a ColourFilter and a ToneCurve work on the linear light that is there.
     - Every augmentation draws for the channels that really reach it (Kornia's containers draw for those of the input).
       A module of one's own says what it gives by a method ``output_channels(channels)``.
     - The first mask is a map of inverse depth [1/m], 0 at infinity, which `RandomDefocus`, `RandomCamera` and `Imaging`
@@ -81,6 +83,7 @@ class CameraSequential(K.AugmentationSequential):
             raise ValueError("random_apply would shuffle camera stages, which light passes in order. Leave it out.")
         self.context()
         _check_geometry(_flat(self.children()))
+        self._linear = _in_linear_light(self.named_children())
 
     def _stages(self) -> list[nn.Module]:
         return [module for module in _flat(self.children()) if isinstance(module, Stage)]
@@ -126,10 +129,15 @@ class CameraSequential(K.AugmentationSequential):
             if self.runs(module):
                 input = self.run(module, input, depth=None)
             else:
-                input = InputSequentialOps.transform(input, module=module, param=param, extra_args=extra_args)
+                told = {**(extra_args or {}), **self.told(param.name)}
+                input = InputSequentialOps.transform(input, module=module, param=param, extra_args=told)
             self._update_transform_matrix_by_module(module)
         self._params = params
         return input
+
+    def told(self, name: str) -> dict[str, Tensor]:
+        """What a child is told of where it stands: that what reaches it is linear light, not a coded picture."""
+        return {"linear": torch.ones(())} if name in self._linear else {}
 
     @staticmethod
     def runs(module: nn.Module) -> bool:
@@ -206,11 +214,12 @@ class _Ops(AugmentationSequentialOps):
                 for value, key in zip(arg, keys, strict=True)
             ]
             return outputs[0] if len(outputs) == 1 else outputs
+        own = owner.told(param.name)
         if getattr(module, "takes_depth", False):
             depth = self._depth(arg, keys)
-            if depth is not None:
-                own = {**extra_args.get(DataKey.INPUT, {}), "inverse_depth": depth}
-                extra_args = {**extra_args, DataKey.INPUT: own}
+            own |= {} if depth is None else {"inverse_depth": depth}
+        if own:
+            extra_args = {**extra_args, DataKey.INPUT: {**extra_args.get(DataKey.INPUT, {}), **own}}
         return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
 
     def _place(self, keys: Sequence[DataKey]) -> int | None:
@@ -277,6 +286,19 @@ def _flat(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
             yield from _flat(module.children())
         else:
             yield module
+
+
+def _in_linear_light(children: Iterable[tuple[str, nn.Module]]) -> set[str]:
+    """Names of our augmentations that stand behind a colour filter or a mosaic and before the tone curve."""
+    linear, found = False, set()
+    for name, module in children:
+        if isinstance(module, (ColourFilter, Mosaic)):
+            linear = True
+        elif isinstance(module, ToneCurve):
+            linear = False
+        elif linear and isinstance(module, CameraAugmentation):
+            found.add(name)
+    return found
 
 
 def _check_geometry(modules: Iterable[nn.Module]) -> None:

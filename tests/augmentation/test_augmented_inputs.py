@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 import kcam.augmentation as KC
-from kcam import isp, optics, sensor
+from kcam import Camera, isp, optics, sensor
 from kcam.units import mm, um
 
 PICTURE = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
@@ -98,3 +98,33 @@ def test_values_a_little_above_white_are_white() -> None:
     result = KC.RandomExposure(0.0, p=1.0)(bright)
     assert result.max() <= 1
     assert np.isclose(float(result[..., 0, 0].min()), 1.0)
+
+
+def test_between_filter_and_tone_curve_the_light_is_linear() -> None:
+    """A raw plane has one channel, as a gray picture has: it must not be taken through the sRGB curve."""
+    noise = KC.RandomShotReadNoise(iso=400.0, p=1.0)
+    stages = sensor.ColourFilter.kodak(), sensor.Exposure(), sensor.Mosaic("RGGB")
+    cube = torch.rand(2, 28, 12, 14, generator=torch.Generator().manual_seed(1))
+    pipeline = KC.CameraSequential(
+        *stages, noise, isp.Demosaic(), isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve()
+    )
+    result = pipeline(cube)
+    seeds = pipeline._params[3].data["noise_seed"]
+    clean = Camera(*stages)(cube)
+    expected = []
+    for plane, seed in zip(clean.split(1), seeds.tolist(), strict=True):
+        generator = torch.Generator().manual_seed(seed)
+        counted = sensor.shot_noise(plane / 4, full_well=10_000.0, generator=generator)
+        read = sensor.read_noise(counted, sigma_electrons=3.0, full_well=10_000.0, generator=generator)
+        expected.append((read * 4).clamp(max=1))
+    developed = Camera(*stages, isp.Demosaic(), isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve())[3:](
+        torch.cat(expected)
+    )
+    assert (result - developed).abs().max() < 1e-5
+    nested = K.ImageSequential(pipeline)
+    assert nested(cube).shape == (2, 3, 12, 14)
+    # behind the tone curve it is a picture again
+    after = KC.CameraSequential(*stages, isp.Demosaic(), isp.ColourMatrix(), isp.ToneCurve(), noise)
+    assert after(cube).max() <= 1
+    assert after.told("RandomShotReadNoise_6") == {}
+    assert pipeline.told("RandomShotReadNoise_3") != {}

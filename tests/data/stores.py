@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -51,11 +52,15 @@ def call(name: str, *arguments: object, status: int = 0) -> str:
 
 
 def start(name: str, *arguments: object) -> subprocess.Popen[str]:
-    """A tool in a process, and a process group, of its own."""
+    """A tool in a process, and a process group, of its own.
+
+    A shell starts what runs in its background deaf to Ctrl-C, and children inherit that: theirs is the usual one.
+    """
     return subprocess.Popen(
         [sys.executable, str(TOOLS / f"{name}.py"), *(str(argument) for argument in arguments)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
 
 
