@@ -136,13 +136,16 @@ def test_sigkill_at_random_moments(tmp_path: Path, workers: int):
 
 def wait_for_work(process: subprocess.Popen[str], out: Path) -> float:
     """Until a run has started to write, or is over; the time."""
-    changed = out.exists() and (out / ".work").exists() and (out / ".work" / "plan.json").stat().st_mtime_ns
+    before = written(out)
     deadline = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < deadline:
-        try:
-            if (out / ".work" / "plan.json").stat().st_mtime_ns != changed:
-                break
-        except OSError:
-            pass
+    while process.poll() is None and written(out) in (None, before) and time.monotonic() < deadline:
         time.sleep(0.005)
     return time.monotonic()
+
+
+def written(out: Path) -> int | None:
+    """When the plan of the work was written; None where there is none, or it is being taken away."""
+    try:
+        return (out / ".work" / "plan.json").stat().st_mtime_ns
+    except OSError:
+        return None
