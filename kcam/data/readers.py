@@ -6,11 +6,13 @@ A reader opens a path as a `Source`, which says the unit, the wavelengths and th
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -226,6 +228,23 @@ def _scaled(values: np.ndarray, divisor: float, clip: bool = False) -> np.ndarra
 # ---- EXR: KAIST ----------------------------------------------------------------------------------------------------
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what a C library writes to the process's standard error: our own line says what is wrong with a file."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
 def _open_kaist(path: Path, options: Options) -> Source:
     """KAIST (Choi et al. 2017): one scanline EXR, channels w420nm ... w720nm; reflectance against Spectralon."""
     try:
@@ -233,7 +252,8 @@ def _open_kaist(path: Path, options: Options) -> Source:
         import OpenEXR
     except ImportError as error:
         raise ImportError("KAIST's files are OpenEXR, which the extra reads: pip install 'kcam[exr]'.") from error
-    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:  # InputFile.header() can crash
+    # InputFile.header() can crash
+    with _quiet(), OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
         if len(file.parts) != 1:
             raise CubeError(f"it has {len(file.parts)} parts, expected one.")
         channels = [(channel.name, channel.xSampling, channel.ySampling) for channel in file.header()["channels"]]
@@ -253,13 +273,10 @@ def _open_kaist(path: Path, options: Options) -> Source:
     pixel_type = Imath.PixelType(Imath.PixelType.FLOAT)
 
     def rows(first: int, last: int) -> tuple[np.ndarray, None]:
-        file = OpenEXR.InputFile(str(path))
-        try:
+        with _quiet(), closing(OpenEXR.InputFile(str(path))) as file:
             if not file.isComplete():
                 raise CubeError("it is cut off: lines are missing.")
             lines = file.channels(ordered, pixel_type, top + first, top + last - 1)
-        finally:
-            file.close()
         values = np.empty((len(ordered), last - first, width), np.float32)
         for plane, pixels in zip(values, lines, strict=True):
             plane[:] = np.frombuffer(pixels, np.float32).reshape(plane.shape)

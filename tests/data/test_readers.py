@@ -398,3 +398,18 @@ def test_a_grey_photograph_is_flat_over_wavelength(tmp_path: Path) -> None:
     cube = read_cube(path, format="rgb", bands=[450 * nm, 550 * nm, 650 * nm])
     expected = ((128 / 255 + 0.055) / 1.055) ** 2.4  # sRGB's own curve
     np.testing.assert_allclose(cube.values.numpy(), expected, rtol=1e-5)
+
+
+def test_a_cut_exr_ends_in_one_error_and_no_chatter(tmp_path, capfd):
+    """OpenEXR writes a line for each block that it misses, to the process's own standard error."""
+    OpenEXR = pytest.importorskip("OpenEXR")
+    planes = {f"w{nm_}nm": np.random.default_rng(0).random((90, 60)).astype(np.float32) for nm_ in range(420, 721, 10)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, dict(planes)) as file:
+        file.write(str(tmp_path / "whole.exr"))
+    cut = tmp_path / "cut.exr"
+    cut.write_bytes((tmp_path / "whole.exr").read_bytes()[:3000])
+    assert read_cube(tmp_path / "whole.exr").shape == (31, 90, 60)
+    with pytest.raises(CubeError):
+        read_cube(cut)
+    assert capfd.readouterr().err == ""
