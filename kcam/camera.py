@@ -158,9 +158,7 @@ class Camera(nn.Module):
         """The same camera with every random stage at its mean; it shares the parameters."""
         return Camera(*(_at_mean(stage) for stage in self), context=self.resolve())
 
-    def plan(
-        self, scenes: Scene | Sequence[Scene], *, tolerance: float | str, max_memory: float | None = None
-    ) -> Plan:
+    def plan(self, scenes: Scene | Sequence[Scene], *, tolerance: float | str, max_memory: float | None = None) -> Plan:
         """What to simulate for these scenes to stay within a tolerance: `kcam.planner.make_plan`."""
         from kcam.planner import make_plan
 

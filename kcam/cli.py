@@ -32,7 +32,12 @@ CameraOption = Annotated[
 
 
 def length(
-    text: str, *, unit: str = "m", name: str = "distance", expected: str = '2, "50 cm" or inf', least: float = 0.0,
+    text: str,
+    *,
+    unit: str = "m",
+    name: str = "distance",
+    expected: str = '2, "50 cm" or inf',
+    least: float = 0.0,
     most: float = math.inf,
 ) -> float:
     """A length in metres from text such as "2", "2 m", "50cm", "550 nm" or "inf".

@@ -93,6 +93,14 @@ def check_values(signal: Tensor, *, picture: bool) -> None:
         )
 
 
+def drawn_rows(params: dict[str, Any], *, p: float) -> Tensor | None:
+    """Which rows of a batch were drawn, (R,); None for all, also where torch.compile must not ask."""
+    if torch.compiler.is_compiling() or p == 1 or "batch_prob" not in params:
+        return None
+    gate = torch.atleast_1d(params["batch_prob"] > 0.5)
+    return None if bool(gate.all()) else gate.nonzero().flatten()
+
+
 class CameraAugmentation(K.IntensityAugmentationBase2D):
     """Base of the augmentations that keep the pixel grid. A subclass computes in `simulate`.
 
@@ -124,6 +132,26 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         """Channels of the result for so many of the input."""
         return channels
 
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """What is drawn; where the channels change, also the shape after it.
+
+        Kornia's containers draw for later stages beforehand, and would for the channels of the input.
+        """
+        drawn = super().generate_parameters(batch_shape)
+        batch, channels = batch_shape[0], batch_shape[-3]
+        after = self.output_channels(channels)
+        if after == channels:
+            return drawn
+        if self.p < 1:
+            raise self._mixed(channels, after)
+        return drawn | {"output_size": torch.tensor([[after, *batch_shape[-2:]]]).expand(batch, 3)}
+
+    def _mixed(self, channels: int, after: int) -> ValueError:
+        return ValueError(
+            f"{type(self).__name__} turns {channels} channels into {after}, which only some rows of a batch cannot "
+            f"have. Use p=1.0, not p={self.p:g}."
+        )
+
     def apply_transform(
         self, input: Tensor, params: dict[str, Any], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
@@ -139,19 +167,15 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         if input.shape[0] == 0 or input.numel() == 0:
             shape = (input.shape[0], self.output_channels(input.shape[1]), *input.shape[2:])
             return input.new_zeros(shape) + input.sum()
-        gate = torch.atleast_1d(params["batch_prob"] > 0.5)
-        if torch.compiler.is_compiling() or self.p == 1 or bool(gate.all()):
+        rows = drawn_rows(params, p=self.p)
+        if rows is None:
             return function(input, drawn)
-        rows = gate.nonzero().flatten()
         if rows.numel() == 0:
             return input
         here = rows.to(input.device)
         result = function(input.index_select(0, here), {name: value[rows] for name, value in drawn.items()})
         if result.shape[1:] != input.shape[1:]:
-            raise ValueError(
-                f"{type(self).__name__} turns {input.shape[1]} channels into {result.shape[1]}, which only some rows "
-                f"of a batch cannot have. Use p=1.0, not p={self.p:g}."
-            )
+            raise self._mixed(input.shape[1], result.shape[1])
         return input.index_copy(0, here, result)
 
     def _drawn(self, params: dict[str, Any]) -> dict[str, Tensor]:

@@ -13,15 +13,13 @@ from torch import Tensor, nn
 
 from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, wavelengths_of
 from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
-from kcam.augmentation.optics import check_inverse_depth
-from kcam.augmentation.sensor import announced
+from kcam.augmentation.optics import LEAST_VERGENCE, finite_vergence
 from kcam.camera import PRESETS, Camera
 from kcam.planner.making import check_tolerance
 from kcam.scene import Scene
 from kcam.ste import clip_ste
 from kcam.units import wavelength_grid
 
-_NEAREST_VERGENCE = 1e-9  # 1/m: a map's 0 is infinity
 _PLANS = 64  # kept
 _SCENE = "coffee"  # what is planned for: detail of all sizes, saturated colours
 
@@ -88,10 +86,6 @@ class RandomCamera(CameraAugmentation):
         """A picture of three channels."""
         return 3
 
-    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """What is drawn, and for Kornia's containers the shape of the picture."""
-        return super().generate_parameters(batch_shape) | announced(self, batch_shape)
-
     def planned(self, index: int, signal: Tensor, *, nearest: float | None = None) -> Camera:
         """The camera that photographs such signals: with its plan for their size, made when it is first asked for.
 
@@ -108,10 +102,10 @@ class RandomCamera(CameraAugmentation):
             camera: Any = self.cameras[index]
             scene = Scene.builtin(_SCENE, shape, wavelengths=bands).to(device=signal.device)
             if nearest is not None:
-                ramp = torch.linspace(far, near, shape[1], dtype=torch.float64).clamp(min=_NEAREST_VERGENCE)
+                ramp = torch.linspace(far, near, shape[1], dtype=torch.float64).clamp(min=LEAST_VERGENCE)
                 scenes = [scene.with_depth((1 / ramp).expand(1, 1, *shape).to(signal.device))]
             else:
-                scenes = [scene.with_depth(1 / max(end, _NEAREST_VERGENCE)) for end in {near, far}]
+                scenes = [scene.with_depth(1 / max(end, LEAST_VERGENCE)) for end in {near, far}]
             plan = camera.plan(scenes, tolerance=self.tolerance)
             # a plain camera: a PlannedCamera would warn of each picture that is not like the fixed scene
             self._planned[key] = Camera(*plan.apply(camera), context=camera.resolve())
@@ -125,7 +119,7 @@ class RandomCamera(CameraAugmentation):
         depths: Sequence[float | Tensor] = distance.unbind() if distance.requires_grad else distance.tolist()
         nearest: Sequence[float | None] = [None] * len(signal)
         if "inverse_depth" in drawn:
-            vergence = check_inverse_depth(drawn["inverse_depth"], signal).double().clamp(min=_NEAREST_VERGENCE)
+            vergence = finite_vergence(drawn["inverse_depth"], signal)
             depths, nearest = (1 / vergence).split(1), vergence.detach().amax((1, 2, 3)).tolist()
         generators = each_generator(drawn["noise_seed"], signal.device)
         pictures = []

@@ -15,8 +15,6 @@ from kcam.units import as_numbers
 Bounds = tuple[float, float] | list[float] | float | Tensor
 """(low, high), or one number for always the same; an nn.Parameter (2,) trains."""
 
-SCALES = ("linear", "log", "vergence")
-
 
 @dataclass(frozen=True)
 class Uniform:

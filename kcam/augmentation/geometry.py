@@ -14,7 +14,7 @@ from kornia.geometry.keypoints import Keypoints
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from kcam.augmentation.base import check_probability
+from kcam.augmentation.base import check_probability, drawn_rows
 from kcam.augmentation.draws import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
@@ -93,9 +93,9 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
-        if self.p == 1 or torch.compiler.is_compiling() or "batch_prob" not in params:
+        rows = drawn_rows(params, p=self.p)
+        if rows is None:
             return self._remapped(input, params, flags, inverse=False)
-        rows = torch.atleast_1d(params["batch_prob"] > 0.5).nonzero().flatten()
         drawn = {name: value[rows] if name in self._param_generator.draws else value for name, value in params.items()}
         here = rows.to(input.device)
         return input.index_copy(0, here, self._remapped(input[here], drawn, flags, inverse=False))

@@ -54,9 +54,9 @@ class RandomBlur(CameraAugmentation):
         """Window of the PSFs [pixels], for the worst that the ranges hold, so that it does not depend on the batch."""
         return self.window(picture, self.widest(wavelengths))
 
-    def window(self, picture: tuple[int, int], width: float) -> tuple[int, int]:
+    def window(self, picture: tuple[int, int], half_width: float) -> tuple[int, int]:
         """Pixels for PSFs of this half width [m]: odd, no more than the picture."""
-        half = math.ceil(width / self.pixel_pitch)
+        half = math.ceil(half_width / self.pixel_pitch)
         height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
         return height, width
 
@@ -117,7 +117,7 @@ class RandomDefocus(RandomBlur):
                    drawn uniformly in 1/m, inf allowed.
                focal_length: f [m]. pixel_pitch: [m]. By default a machine-vision camera, 8 mm with 4 um pixels.
                layers: of a depth map.
-               Others: as for `RandomBlur`.
+               Others: as for `kcam.augmentation.optics.RandomBlur`.
     Raises:    ValueError for bounds out of range, a focus inside the focal length; at the call for a map of another
         shape or below 0.
     Valid      where `batch_psf` is: paraxial, 1 % where a^4 / (8 d^3 lambda) is below 0.005 waves.
@@ -228,8 +228,8 @@ class RandomDefocus(RandomBlur):
         share = torch.linspace(0, 1, self.layers, dtype=low.dtype, device=low.device)
         vergences = low + (high - low) * (share if self.layers > 1 else share + 0.5)
         wavelengths = wavelengths_of(signal, self.wavelengths)
-        width = self.reach(float(low.detach()), float(high.detach()), wavelengths=wavelengths)
-        shape = self.window((signal.shape[-2], signal.shape[-1]), width)
+        half_width = self.reach(float(low.detach()), float(high.detach()), wavelengths=wavelengths)
+        shape = self.window((signal.shape[-2], signal.shape[-1]), half_width)
         drawn = drawn | {"vergences": vergences[None]}
         return vergences, self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)[0]
 
@@ -247,6 +247,15 @@ def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:
             "the distance in metres, 0 at infinity."
         )
     return depth.to(signal.device)
+
+
+LEAST_VERGENCE = 1e-9
+"""1/m: where a distance is asked for, a map's 0 is a million kilometres."""
+
+
+def finite_vergence(depth: Tensor, signal: Tensor) -> Tensor:
+    """A map of inverse depth that a distance can be made of, float64; errors as `check_inverse_depth`."""
+    return check_inverse_depth(depth, signal).double().clamp(min=LEAST_VERGENCE)
 
 
 class FocusedBlur(RandomBlur):
@@ -316,7 +325,8 @@ class FocusedBlur(RandomBlur):
 class RandomDiffraction(FocusedBlur):
     """A lens in focus and stopped down: Airy discs, larger in red than in blue.
 
-    Args:      f_number: N, drawn uniformly in its logarithm. focal_length, pixel_pitch: [m]. Others: as `RandomBlur`.
+    Args:      f_number: N, drawn uniformly in its logarithm. focal_length, pixel_pitch: [m].
+               Others: as for `kcam.augmentation.optics.RandomBlur`.
     """
 
     def __init__(
@@ -350,7 +360,8 @@ class RandomAberration(FocusedBlur):
     W = sum_j c_j Z_j,   sum_j c_j^2 = (rms 550 nm)^2,   in a direction that is uniform on the sphere
 
     Args:      rms: of the wavefront [waves at 550 nm], up to 5; 0.07 is what counts as diffraction limited.
-               f_number, focal_length, pixel_pitch: of the lens. Others: as for `RandomBlur`.
+               f_number, focal_length, pixel_pitch: of the lens. Others: as for `kcam.augmentation.optics.RandomBlur`.
+               The time rises as the square of rms, and with the aperture: seconds for a picture at 5 waves and f/2.
     Source:    Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
 
@@ -405,7 +416,7 @@ class RandomChromaticAberration(FocusedBlur):
 
     Args:      axial: share of a simple lens's focal shift that is left; 1 is a singlet. lateral: difference of
                    magnification between F and C light, signed. f_number, focal_length, pixel_pitch: of the lens.
-               glass: a name in `optics.GLASSES`. Others: as for `RandomBlur`.
+               glass: a name in `optics.GLASSES`. Others: as for `kcam.augmentation.optics.RandomBlur`.
     """
 
     def __init__(

@@ -63,10 +63,6 @@ class RandomBayer(CameraAugmentation):
         """A picture stays one; a cube becomes one of three channels."""
         return channels if channels == 1 else 3
 
-    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """The pattern, and for Kornia's containers the shape after a cube has become a picture."""
-        return super().generate_parameters(batch_shape) | announced(self, batch_shape)
-
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Each pattern's rows at once."""
         result = signal.new_zeros(len(signal), self.output_channels(signal.shape[1]), *signal.shape[2:])
@@ -85,20 +81,6 @@ class RandomBayer(CameraAugmentation):
         wavelengths = wavelength_grid(count=signal.shape[1]) if self.wavelengths is None else self.wavelengths
         stages = (own, Mosaic(pattern), Exposure(), Demosaic(self.method), WhiteBalance(), ColourMatrix(), ToneCurve())
         return Camera(*stages, context=Context(wavelengths=wavelengths))(signal)
-
-
-def announced(stage: CameraAugmentation, batch_shape: Sequence[int]) -> dict[str, Tensor]:
-    """For Kornia's containers, which draw for later stages beforehand: the shape after this one, where it changes."""
-    batch, channels = batch_shape[0], batch_shape[-3]
-    after = stage.output_channels(channels)
-    if after == channels:
-        return {}
-    if stage.p < 1:
-        raise ValueError(
-            f"{type(stage).__name__} turns {channels} channels into {after}, which only some rows of a batch cannot "
-            f"have. Use p=1.0, not p={stage.p:g}."
-        )
-    return {"output_size": torch.tensor([[after, *batch_shape[-2:]]]).expand(batch, 3)}
 
 
 class RandomShotReadNoise(CameraAugmentation):

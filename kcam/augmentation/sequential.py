@@ -18,7 +18,7 @@ from kornia.constants import DataKey
 from torch import Tensor, nn
 
 from kcam.augmentation.base import CameraAugmentation, wavelengths_of
-from kcam.augmentation.optics import check_inverse_depth
+from kcam.augmentation.optics import finite_vergence
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context, Stage
 from kcam.isp import ToneCurve
@@ -27,7 +27,6 @@ from kcam.scene import Scene
 from kcam.sensor import ColourFilter, Mosaic
 from kcam.units import wavelength_grid
 
-_LEAST_VERGENCE = 1e-9  # 1/m
 _NEAR = 100.0  # 1/m, a centimetre: nearer than pictures are taken from
 
 
@@ -95,25 +94,28 @@ class CameraSequential(K.AugmentationSequential):
 
     def output_channels(self, channels: int) -> int:
         """Channels of the result for so many of the input."""
+        context = self.context()
         for module in self.children():
-            channels = self._after(module, channels)
+            channels = self._after(module, channels, context)
         return channels
 
-    def _after(self, module: nn.Module, channels: int) -> int:
+    @staticmethod
+    def _after(module: nn.Module, channels: int, context: Context | None = None) -> int:
         if isinstance(module, Stage):
-            return module.output_channels(channels, self.context())
+            return module.output_channels(channels, context)
         known: Any = getattr(module, "output_channels", None)
         return known(channels) if callable(known) else channels
 
     def forward_parameters(self, batch_shape: torch.Size) -> list[ParamItem]:
         """Kornia's, for the shape that really reaches each module."""
         params = []
+        context = self.context()
         module: Any
         for name, module in self.get_forward_sequence():
             draws = isinstance(module, (_AugmentationBase, K.MixAugmentationBaseV2, ImageSequentialBase))
             param = ParamItem(name, module.forward_parameters(batch_shape) if draws else None)
             after = list(_get_new_batch_shape(param, batch_shape, module))
-            after[-3] = self._after(module, batch_shape[-3])
+            after[-3] = self._after(module, batch_shape[-3], context)
             batch_shape = torch.Size(after)
             params.append(param)
         return params
@@ -161,10 +163,11 @@ class CameraSequential(K.AugmentationSequential):
             return module(input, context)
         result = module(input)
         after = result.shape[1] if isinstance(result, Tensor) and result.ndim == 4 else channels
-        if after != self._after(module, channels):
+        expected = self._after(module, channels)
+        if after != expected:
             raise ValueError(
                 f"{type(module).__name__} gave {after} channels for {channels}, and what follows was drawn for "
-                f"{self._after(module, channels)}. Give it a method output_channels(channels) that returns {after}."
+                f"{expected}. Give it a method output_channels(channels) that returns {after}."
             )
         return result
 
@@ -275,9 +278,10 @@ def _check_is_depth(mask: Any) -> None:
 
 
 def _scene(bands: Tensor, depth: Tensor, context: Context) -> Scene:
-    vergence = check_inverse_depth(depth, bands).double().clamp(min=_LEAST_VERGENCE)
     light = "D65" if context.illuminant is None else context.illuminant
-    return Scene.from_bands(bands, wavelengths=context.wavelengths, depth=1 / vergence, illuminant=light)
+    return Scene.from_bands(
+        bands, wavelengths=context.wavelengths, depth=1 / finite_vergence(depth, bands), illuminant=light
+    )
 
 
 def _flat(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kcam.data.cube import SUFFIX, CubeError, write_source
+from kcam.data.cube import SUFFIX, CubeError, first_line, write_source
 from kcam.data.readers import Options, open_source, resampled, scene_name, scenes_in
 
 
@@ -129,7 +129,7 @@ def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
     except MemoryError:
         return "it does not fit into memory."
     except Exception as error:
-        return f"it cannot be read: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
+        return f"it cannot be read: {type(error).__name__}: {first_line(error)}"
 
 
 def _depth(path: Path) -> np.ndarray:

@@ -36,6 +36,14 @@ class CubeError(ValueError):
     """A cube that cannot be read or is not what it says; one line."""
 
 
+NOTHING_VALID = "it holds no valid pixel: all are NaN, infinite or marked as invalid."
+
+
+def first_line(error: BaseException) -> str:
+    """What a library's error says, in one line of bounded length."""
+    return (str(error).strip().splitlines() or [""])[0][:200]
+
+
 @dataclass(frozen=True)
 class Cube:
     """Spectral values of a scene.
@@ -119,7 +127,7 @@ class Source:
         """All of it, in memory."""
         values, valid = self.checked_rows(0, self.shape[1])
         if valid is not None and not valid.any():
-            raise CubeError("it holds no valid pixel: all are NaN, infinite or marked as invalid.")
+            raise CubeError(NOTHING_VALID)
         mask = None
         if valid is not None or (self.extrapolated is not None and self.extrapolated.any()):
             pixels = np.ones(self.shape[1:], bool) if valid is None else valid
@@ -143,8 +151,8 @@ class Source:
         except MemoryError as error:
             raise CubeError("it does not fit into memory.") from error
         except Exception as error:
-            reason = (str(error).strip().splitlines() or [""])[0][:200]
-            raise CubeError(f"rows {first} to {last} cannot be read: {type(error).__name__}: {reason}") from error
+            what = f"{type(error).__name__}: {first_line(error)}"
+            raise CubeError(f"rows {first} to {last} cannot be read: {what}") from error
         finite = np.isfinite(values).all(0)
         valid = finite if valid is None else valid & finite
         if valid.all():
@@ -223,7 +231,7 @@ def write_source(path: str | os.PathLike[str], source: Source) -> dict[str, Any]
                     invalid[first:last] = ~valid
                 low, high = min(low, float(part.min())), max(high, float(part.max()))
         if invalid.all():
-            raise CubeError("it holds no valid pixel: all are NaN, infinite or marked as invalid.")
+            raise CubeError(NOTHING_VALID)
         with tifffile.TiffWriter(temporary, append=True) as file:
             if invalid.any():
                 file.write((~invalid).astype(np.uint8) * 255, **how)

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from kcam import __version__
-from kcam.data.cube import SUFFIX, CubeError, Source, open_cube
+from kcam.data.cube import NOTHING_VALID, SUFFIX, CubeError, Source, first_line, open_cube
 from kcam.files import replace, replacing
 from kcam.units import nm
 
@@ -219,7 +219,7 @@ def _opened(path: Path) -> Source:
     except (CubeError, OSError):
         raise
     except Exception as error:
-        raise CubeError(f"it cannot be read: {type(error).__name__}: {str(error).splitlines()[:1]}") from error
+        raise CubeError(f"it cannot be read: {type(error).__name__}: {first_line(error)}") from error
 
 
 # ---- one scene -----------------------------------------------------------------------------------------------------
@@ -232,20 +232,16 @@ def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, 
         raise CubeError(f"it is {source.shape} now and was {job.shape} when the store was planned.")
     bands, height, width = source.shape
     scale = _brightest(source, settings.size)
-    found = positions((height, width), settings)
     kept: list[list[int]] = []
     dropped = {"invalid": 0, "empty": 0, "saturated": 0, "flat": 0}
     sums, squares = [0] * bands, [0] * bands
-    digest = hashlib.sha256()
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"{job.name}.npy"
     size = settings.size
     with replacing(target) as temporary, temporary.open("wb") as file:
         file.write(bytes(_HEADER))
         for top, values, valid in _strips(source, settings):
-            for y, x in found:
-                if y != top:
-                    continue
+            for x in range(0, width - size + 1, settings.stride):
                 patch = values[:, :, x : x + size]
                 reason = _reason(patch, None if valid is None else valid[:, x : x + size], scale, settings)
                 if reason:
@@ -253,7 +249,7 @@ def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, 
                     continue
                 numbers = np.rint(np.clip(patch, 0, scale) * np.float32(TOP / scale)).astype("<u2")
                 file.write(numbers.tobytes())
-                kept.append([y, x])
+                kept.append([top, x])
                 whole = numbers.reshape(bands, -1).astype(np.uint64)
                 for band in range(bands):
                     sums[band] += int(whole[band].sum())
@@ -264,17 +260,15 @@ def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, 
         if file.tell() != _HEADER:
             raise StoreError(f"the header of {target.name} takes {file.tell()} bytes, not {_HEADER}.")
         file.flush()
-        with temporary.open("rb") as whole_file:
-            for block in iter(lambda: whole_file.read(2**22), b""):
-                digest.update(block)
+        digest = _sha256(temporary)
     return {
         "scene": job.name,
         "group": job.group,
         "split": job.split,
         "file": f"scenes/{job.name}.npy",
-        "sha256": digest.hexdigest(),
+        "sha256": digest,
         "count": len(kept),
-        "candidates": len(found),
+        "candidates": len(positions((height, width), settings)),
         "dropped": dropped,
         "scale": float(scale) / TOP,
         "positions": kept,
@@ -287,6 +281,11 @@ def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, 
     }
 
 
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _brightest(source: Source, strip: int) -> np.float32:
     """The largest valid value: what 65535 stands for."""
     high, any_valid = np.float32(0), False
@@ -294,7 +293,7 @@ def _brightest(source: Source, strip: int) -> np.float32:
         values, valid = source.checked_rows(first, min(first + strip, source.shape[1]))
         high, any_valid = max(high, values.max()), any_valid or valid is None or bool(valid.any())
     if not any_valid:
-        raise CubeError("it holds no valid pixel: nothing but NaN, infinity, or what its mask rules out.")
+        raise CubeError(NOTHING_VALID)
     if not high > 1e-30:  # below, 65535 / high leaves float32
         raise CubeError("it is black: no value is above 0.")
     return np.float32(high)
@@ -497,7 +496,7 @@ def work_on(job: SceneJob, settings: Settings, out: str) -> str | None:
     except MemoryError:
         return "it does not fit into memory."
     except Exception as error:
-        return f"it cannot be read: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
+        return f"it cannot be read: {type(error).__name__}: {first_line(error)}"
     return None
 
 
@@ -706,12 +705,9 @@ def verify(store: str | os.PathLike[str]) -> list[str]:
 def _file_problems(folder: Path, document: dict[str, Any], record: dict[str, Any]) -> list[str]:
     try:
         scene_array(folder, document, record)
-        digest = hashlib.sha256()
-        with (folder / record["file"]).open("rb") as file:
-            for block in iter(lambda: file.read(2**22), b""):
-                digest.update(block)
+        digest = _sha256(folder / record["file"])
     except (StoreError, OSError) as error:
         return [str(error)]
-    if digest.hexdigest() != record["sha256"]:
+    if digest != record["sha256"]:
         return [f"{folder / record['file']} is not what was written: its sha256 differs."]
     return []

@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tifffile
 import torch
 
 from kcam import spectral
 from kcam.data.bands import resampling
-from kcam.data.cube import MOST_VALUES, Cube, CubeError, Source, is_cube, open_cube
-from kcam.scene import read_picture
+from kcam.data.cube import MOST_VALUES, Cube, CubeError, Source, first_line, is_cube, open_cube
+from kcam.scene import Scene, read_picture
 from kcam.units import nm, wavelength_grid
 
 CASSI_NM = (
@@ -119,7 +120,7 @@ def open_source(path: Path, *, format: str | None = None, options: Options | Non
     except MemoryError as error:
         raise CubeError("it does not fit into memory.") from error
     except Exception as error:
-        raise CubeError(f"it cannot be read as {row.name}: {type(error).__name__}: {_first_line(error)}") from error
+        raise CubeError(f"it cannot be read as {row.name}: {type(error).__name__}: {first_line(error)}") from error
 
 
 def recognised(path: Path) -> Format | None:
@@ -174,10 +175,6 @@ def _check_bomb(promised: int, stored: int, what: str = "its header") -> None:
         raise CubeError(f"{what} promises {promised / 1e6:.0f} MB in {stored / 1e6:.3g} MB of data: it is damaged.")
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [""])[0][:200]
-
-
 def _known(path: Path, options: Options, count: int, otherwise: np.ndarray | None = None) -> np.ndarray:
     """The wavelengths of a file that does not hold them, [m]."""
     grid = otherwise if options.wavelengths is None else options.wavelengths
@@ -218,6 +215,11 @@ def _check_size(shape: Iterable[int], what: str = "its array") -> tuple[int, ...
     if product < 1 or product > MOST_VALUES:
         raise CubeError(f"{what} says it is {' x '.join(map(str, sizes))}: no cube has that size.")
     return sizes
+
+
+def _largest(dtype: np.dtype) -> float:
+    """What whole numbers of 8 or 16 bits are divided by; others are taken as they are."""
+    return {"u1": 255.0, "u2": 65535.0}.get(dtype.kind + str(dtype.itemsize), 1.0)
 
 
 def _scaled(values: np.ndarray, divisor: float, clip: bool = False) -> np.ndarray:
@@ -612,8 +614,6 @@ def _open_envi(path: Path, options: Options) -> Source:
 
 def _open_tiff(path: Path, options: Options) -> Source:
     """TIFF: a page per band, or all bands in one page; 8 and 16 bits over their largest value, floats as they are."""
-    import tifffile
-
     with tifffile.TiffFile(path) as file:
         if not file.series:
             raise CubeError("it has no pages.")
@@ -633,9 +633,9 @@ def _open_tiff(path: Path, options: Options) -> Source:
         values = values[None]
     if values.ndim != 3 or values.dtype.kind not in "fui":
         raise CubeError(f"it holds {' x '.join(map(str, sizes))} of {values.dtype}, expected bands of numbers.")
-    if names.endswith("S") or (names == "YXS") or (options.wavelengths is not None and _last_is_bands(values, options)):
+    if names.endswith("S") or (options.wavelengths is not None and _last_is_bands(values, options)):
         values = values.transpose(2, 0, 1)
-    divisor = {"u1": 255.0, "u2": 65535.0}.get(values.dtype.kind + str(values.dtype.itemsize), 1.0)
+    divisor = _largest(values.dtype)
     grid = _known(path, options, len(values))
     facts = {"scaling": f"/ {divisor:g}", "orientation": "as stored"}
     return Source(scene_name(path), values.shape, grid, "relative radiance", _whole(_scaled(values, divisor)), facts)
@@ -643,8 +643,6 @@ def _open_tiff(path: Path, options: Options) -> Source:
 
 def _is_tiff_stack(path: Path) -> bool:
     """A TIFF that is no photograph of three or four colours."""
-    import tifffile
-
     if path.suffix.lower() not in (".tif", ".tiff") or not path.is_file():
         return False
     with tifffile.TiffFile(path) as file:
@@ -694,7 +692,7 @@ def _open_npz(path: Path, options: Options) -> Source:
     grid = own if options.wavelengths is None else options.wavelengths
     if grid is not None and values.shape[0] != len(grid) and values.shape[2] == len(grid):
         values = values.transpose(2, 0, 1)
-    divisor = {"u1": 255.0, "u2": 65535.0}.get(values.dtype.kind + str(values.dtype.itemsize), 1.0)
+    divisor = _largest(values.dtype)
     grid = _known(path, options, len(values), own)
     facts = {"scaling": f"{key} / {divisor:g}", "orientation": "as stored"}
     return Source(scene_name(path), values.shape, grid, "relative radiance", _whole(_scaled(values, divisor)), facts)
@@ -714,8 +712,6 @@ def _npy(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
 
 def _open_rgb(path: Path, options: Options) -> Source:
     """A photograph: reflectances with its colours, upsampled by `spectral.rgb_basis`; light is not put on them."""
-    from kcam.scene import Scene
-
     picture = read_picture(path)
     grid = wavelength_grid() if options.bands is None else torch.from_numpy(options.bands)
     scene = Scene.from_rgb(picture, wavelengths=grid, illuminant="E")

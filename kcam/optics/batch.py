@@ -193,7 +193,7 @@ def _radial_bank(
     half = max(shape) // 2
     with torch.no_grad():
         fastest = float(scales.max()) * pixel_pitch  # t per pixel
-        defocus = float((residual.abs().amax((1, 2)) * d * a * wavenumbers.max() * a / d).max())  # of the rim ray, in t
+        defocus = float((residual.abs().amax((1, 2)) * a**2).max() * wavenumbers.max())  # of the rim ray, in t
         per_pixel = 2 ** max(3, math.ceil(math.log2(_PROFILE_STEPS * fastest / math.pi)))
         corner = math.sqrt(2) * (half + 0.5)
         nodes, arguments = _rounded((fastest * corner + defocus) / 2 + 32), _rounded(fastest * corner / _STEP + 8)

@@ -155,7 +155,6 @@ class MatrixTransform:
         left = [torch.nn.functional.pad(half[..., :k].flip(-1), (1, 0)) for half in (down, up)]
         return torch.stack([down[..., k:], left[0], up[..., k:], left[1]], dim=-3)
 
-
     def arrange_points(self, image: Tensor) -> Tensor:
         k = self.cosine_sine.shape[-1] - 1
         up, down = image[: k + 1].flip(0), image[k:]
@@ -501,6 +500,4 @@ def pupil_intensity(
     re, im = field if field is not None else (None, None)
     with full_precision(coefficients.device):
         curvature = torch.zeros_like(scales[0]) if tau is None else tau.to(scales)
-        return _PupilIntensity.apply(
-            coefficients, maps, amplitude, re, im, scales, curvature, transforms, nodes, step
-        )
+        return _PupilIntensity.apply(coefficients, maps, amplitude, re, im, scales, curvature, transforms, nodes, step)

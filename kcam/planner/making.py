@@ -66,9 +66,7 @@ class Planner:
     Arguments and errors: as `make_plan`.
     """
 
-    def __init__(
-        self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None
-    ) -> None:
+    def __init__(self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None) -> None:
         start = time.perf_counter()
         self.camera = camera
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
