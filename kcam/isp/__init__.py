@@ -1,4 +1,4 @@
-"""From the raw picture to the finished one: demosaic, white balance, colour matrix, tone curve."""
+"""From the raw picture to the finished one: demosaic, white balance, colour matrix, tone curve, style."""
 
 from kcam.isp.colour import (
     Clip,
@@ -12,6 +12,7 @@ from kcam.isp.colour import (
     tone_curve,
     white_balance,
 )
+from kcam.isp.convolution import Convolution, convolve_planes
 from kcam.isp.demosaic import (
     DEMOSAICS,
     Demosaic,
@@ -20,19 +21,23 @@ from kcam.isp.demosaic import (
     demosaic,
     learned_demosaic,
 )
+from kcam.isp.style_stage import StyleStage
 
 __all__ = [
     "DEMOSAICS",
     "Clip",
     "ColourMatrix",
+    "Convolution",
     "Demosaic",
     "DemosaicMethod",
     "LearnedDemosaic",
+    "StyleStage",
     "ToneCurve",
     "WhiteBalance",
     "apply_colour_matrix",
     "as_shot_colour_matrix",
     "as_shot_gains",
+    "convolve_planes",
     "demosaic",
     "fit_colour_matrix",
     "learned_demosaic",

@@ -159,7 +159,11 @@ class Plan:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the plan as JSON; an old file of that name is replaced when the new one is whole."""
-        files.replace(path, (json.dumps(asdict(self), indent=1) + "\n").encode())
+        files.replace(path, (self.to_json() + "\n").encode())
+
+    def to_json(self) -> str:
+        """The plan as text; numbers come back as they were."""
+        return json.dumps(asdict(self), indent=1)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Plan:
@@ -168,14 +172,22 @@ class Plan:
         if not path.is_file():
             raise FileNotFoundError(f"there is no file {path}. A plan is written by plan.save({str(path)!r}).")
         try:
-            content = json.loads(path.read_text())
+            return cls.from_json(path.read_text())
+        except ValueError as error:
+            raise ValueError(f"{path} is not a plan that Plan.save wrote: {error}.") from error
+
+    @classmethod
+    def from_json(cls, text: str) -> Plan:
+        """The plan that `to_json` wrote. Raises: ValueError for another text."""
+        try:
+            content = json.loads(text)
             content["decisions"] = tuple(Decision(**row) for row in content["decisions"])
             content["range"] = Range(**content["range"] | {"wavelengths": tuple(content["range"]["wavelengths"])})
             content["changes"] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["changes"].items()}
             content |= {key: tuple(content[key]) for key in ("skipped", "stages")}
             return cls(**content)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} is not a plan that Plan.save wrote: {error!r}.") from error
+            raise ValueError(f"{error!r}") from error
 
     def __str__(self) -> str:
         return _table(self)

@@ -203,9 +203,17 @@ class ColourFilter(Stage):
         fit = fitted("kodak")
         index = torch.arange(tile) % 2
         alpha = fit.coefficients[pattern_tile("RGGB")[index[:, None], index]]
-        alpha = alpha.clamp(min=LEAST_ALPHA)  # at 0 the softplus has no inverse, and near it no slope to learn by
+        return cls(alpha.float(), width=fit.width, infrared_cut=infrared_cut).trainable()
+
+    def trainable(self) -> ColourFilter:
+        """A filter of these curves to train, non-negative by softplus whatever it learns.
+
+        Coefficients below 0.01 start there: at 0 the softplus has no inverse, and near it no slope to learn by.
+        """
+        alpha = self.alpha().detach().double().clamp(min=LEAST_ALPHA)
         raw = alpha + torch.log(-torch.expm1(-SHARPNESS * alpha)) / SHARPNESS
-        return cls(nn.Parameter(raw.float()), softplus=True, width=fit.width, infrared_cut=infrared_cut)
+        cut = self.infrared_cut
+        return ColourFilter(nn.Parameter(raw.float()), softplus=True, width=self.width, infrared_cut=cut)
 
     @classmethod
     def _fitted(cls, name: str, infrared_cut: float | None) -> ColourFilter:

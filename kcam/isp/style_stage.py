@@ -1,0 +1,212 @@
+"""The style stage: a small feed-forward network after the camera, which paints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from kcam.context import Context, Stage
+
+SEEN_AT_ONCE = 2**20
+"""Pixels; a larger picture is painted in tiles."""
+TILE = 512
+WINDOWS = 4
+"""Across and down: where the statistics of a picture in tiles are taken."""
+DARKEST = 0.03
+"""What black is taken for, and 1 - 0.03 for white, so that strokes can lie on them: the logit has no bound."""
+
+
+class _Conv(nn.Conv2d):
+    """A convolution that continues the picture by its border."""
+
+    def __init__(self, channels: int, out: int, side: int, *, stride: int = 1, dilation: int = 1) -> None:
+        border = dilation * (side // 2)
+        super().__init__(
+            channels, out, side, stride=stride, dilation=dilation, padding=border, padding_mode="replicate"
+        )
+
+
+class _Norm(nn.Module):
+    """Instance normalisation with gain and offset, whose statistics can be taken elsewhere than where they are used."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor, given: Iterator[tuple[Tensor, Tensor]] | None, seen: list | None) -> Tensor:
+        if given is not None:
+            mean, variance = next(given)
+        else:
+            over = (2, 3) if seen is None else (0, 2, 3)
+            variance, mean = torch.var_mean(x, over, correction=0, keepdim=True)
+        if seen is not None:
+            seen.append((mean, variance))
+        gain = self.weight[:, None, None] * torch.rsqrt(variance + 1e-5)
+        return x * gain + (self.bias[:, None, None] - mean * gain)
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int, dilation: int) -> None:
+        super().__init__()
+        self.first, self.first_norm = _Conv(channels, channels, 3, dilation=dilation), _Norm(channels)
+        self.second, self.second_norm = _Conv(channels, channels, 3, dilation=dilation), _Norm(channels)
+
+    def forward(self, x: Tensor, given: Iterator | None, seen: list | None) -> Tensor:
+        inner = F.relu(self.first_norm(self.first(x), given, seen))
+        return x + self.second_norm(self.second(inner), given, seen)
+
+
+class StyleStage(Stage):
+    """A feed-forward network that repaints a picture, in the manner of Johnson et al. (2016), with noise.
+
+    y = sigmoid( M logit(x) + network(x, noise) )
+
+    Down to a quarter of the size in two strided convolutions, dilated residual blocks, back up by nearest neighbours.
+    Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
+    the picture and at a quarter of its size, let strokes grow there (as in texture networks). As it is built it changes
+    nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
+
+    The noise comes from the context's generator: the same generator state, picture and weights give the same bytes. A
+    picture of more than a megapixel is painted tile by tile; the statistics that its instance normalisation divides by
+    are then those of 4 x 4 windows spread over it.
+
+    Args:      width: channels at full size; twice and four times as many at half and a quarter.
+               dilations: of the residual blocks.
+               noise: planes at full size, and at a quarter.
+               level: of the noise, 1.0 as trained; 0 for none.
+    Raises:    ValueError for a width, a dilation or a number of planes that is not positive, a negative level, and at
+               the call for another number of channels than 3.
+    Source:    Johnson, Alahi and Fei-Fei, Perceptual losses for real-time style transfer and super-resolution (2016);
+               Ulyanov et al., Texture networks (2016), the noise; instance normalisation (2016).
+    """
+
+    def __init__(
+        self,
+        *,
+        width: int = 16,
+        dilations: Sequence[int] = (1, 2, 4, 1),
+        noise: tuple[int, int] = (3, 8),
+        level: float = 1.0,
+    ) -> None:
+        super().__init__()
+        for name, values in (("width", (width,)), ("dilations", tuple(dilations)), ("noise", tuple(noise))):
+            if not values or not all(isinstance(value, int) and value >= (name != "noise") for value in values):
+                raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
+        if not level >= 0:
+            raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
+        self.width, self.dilations, self.noise, self.level = width, tuple(dilations), tuple(noise), level
+        half, quarter = 2 * width, 4 * width
+        self.enter, self.enter_norm = _Conv(3 + noise[0], width, 5), _Norm(width)
+        self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
+        self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
+        self.mix = _Conv(quarter + noise[1], quarter, 1)
+        self.blocks = nn.ModuleList(_Residual(quarter, dilation) for dilation in self.dilations)
+        self.up1, self.up1_norm = _Conv(quarter, half, 3), _Norm(half)
+        self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
+        self.leave = _Conv(width, 3, 5)
+        self.colour = nn.Parameter(torch.eye(3))
+        self._start()
+
+    def _start(self) -> None:
+        """The same start every time, whatever torch's own generator has given to others."""
+        seeded = torch.Generator("cpu").manual_seed(0)
+        for layer in self.modules():
+            if isinstance(layer, _Conv):
+                nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=seeded)
+                nn.init.zeros_(layer.bias)
+        nn.init.zeros_(self.leave.weight)
+
+    @property
+    def reach(self) -> int:
+        """How far from a pixel its result can depend on the picture, but for the statistics, a multiple of 4."""
+        return 4 * (2 * sum(self.dilations) + 4)
+
+    def mean(self) -> StyleStage:
+        """The stage without its noise: one picture of those that it paints, not their mean. Shares the weights."""
+        quiet = StyleStage(width=self.width, dilations=self.dilations, noise=self.noise, level=0.0)
+        for name, module in self.named_children():
+            setattr(quiet, name, module)
+        return quiet
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,3,H,W) sRGB in [0,1] to the same shape, in (0,1)."""
+        if signal.ndim != 4 or signal.shape[1] != 3:
+            raise ValueError(
+                f"StyleStage repaints pictures (B,3,H,W), got shape {tuple(signal.shape)}. Put it behind the ToneCurve."
+            )
+        if signal.numel() == 0:
+            return signal
+        height, width = signal.shape[-2:]
+        whole = F.pad(signal, (0, -width % 4, 0, -height % 4), mode="replicate")
+        noise = self._noise(whole, (context or Context()).generator)
+        painted = self._paint(whole, noise) if height * width <= SEEN_AT_ONCE else self._in_tiles(whole, noise)
+        return painted[..., :height, :width]
+
+    def _noise(self, picture: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Planes at full size and at a quarter, for the whole picture."""
+        batch, _, height, width = picture.shape
+        where = {"dtype": picture.dtype, "device": picture.device}
+        shapes = ((batch, self.noise[0], height, width), (batch, self.noise[1], height // 4, width // 4))
+        if self.level == 0:
+            return picture.new_zeros(shapes[0]), picture.new_zeros(shapes[1])
+        if generator is not None and generator.device != picture.device:
+            where["device"] = generator.device
+        fine, coarse = (torch.randn(shape, generator=generator, **where).to(picture.device) for shape in shapes)
+        return self.level * fine, self.level * coarse
+
+    def _paint(
+        self, picture: Tensor, noise: tuple[Tensor, Tensor], *, given: list | None = None, seen: list | None = None
+    ) -> Tensor:
+        """The network on a picture whose sides are multiples of 4, with its own statistics or the given ones."""
+        how = (None if given is None else iter(given), seen)
+        coded = torch.logit(picture.clamp(DARKEST, 1 - DARKEST))
+        x = F.relu(self.enter_norm(self.enter(torch.cat([2 * picture - 1, noise[0]], dim=1)), *how))
+        x = F.relu(self.down1_norm(self.down1(x), *how))
+        x = F.relu(self.down2_norm(self.down2(x), *how))
+        x = self.mix(torch.cat([x, noise[1]], dim=1))
+        for block in self.blocks:
+            x = block(x, *how)
+        x = F.relu(self.up1_norm(self.up1(F.interpolate(x, scale_factor=2, mode="nearest")), *how))
+        x = F.relu(self.up2_norm(self.up2(F.interpolate(x, scale_factor=2, mode="nearest")), *how))
+        return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
+
+    def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
+        """A large picture, tile by tile with a border as wide as the reach: bounded memory, no seams."""
+        result = torch.empty_like(picture)
+        for index in range(len(picture)):
+            own, planes = picture[index : index + 1], tuple(plane[index : index + 1] for plane in noise)
+            statistics: list = []
+            self._paint(*_windows(own, planes), seen=statistics)
+            for top in range(0, own.shape[-2], TILE):
+                for left in range(0, own.shape[-1], TILE):
+                    inner = (top, left, min(top + TILE, own.shape[-2]), min(left + TILE, own.shape[-1]))
+                    outer = tuple(edge - self.reach for edge in inner[:2]) + tuple(e + self.reach for e in inner[2:])
+                    y0, x0, y1, x1 = max(outer[0], 0), max(outer[1], 0), *outer[2:]
+                    part, parts = own[..., y0:y1, x0:x1], _cut(planes, y0, x0, y1, x1)
+                    painted = self._paint(part, parts, given=statistics)
+                    y, x = inner[0] - y0, inner[1] - x0
+                    height, width = inner[2] - inner[0], inner[3] - inner[1]
+                    result[index, :, top : inner[2], left : inner[3]] = painted[0, :, y : y + height, x : x + width]
+        return result
+
+
+def _cut(planes: tuple[Tensor, ...], top: int, left: int, bottom: int, right: int) -> tuple[Tensor, Tensor]:
+    fine, coarse = planes
+    return fine[..., top:bottom, left:right], coarse[..., top // 4 : bottom // 4, left // 4 : right // 4]
+
+
+def _windows(picture: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Windows spread over a large picture, as a batch."""
+    side = TILE // 2
+    tops, lefts = (
+        (torch.linspace(0, max(size - side, 0), WINDOWS) / 4).int().mul(4).tolist() for size in picture.shape[-2:]
+    )
+    places = [(top, left) for top in tops for left in lefts]
+    parts = [_cut(planes, top, left, top + side, left + side) for top, left in places]
+    cut = torch.cat([picture[..., top : top + side, left : left + side] for top, left in places])
+    return cut, (torch.cat([fine for fine, _ in parts]), torch.cat([coarse for _, coarse in parts]))

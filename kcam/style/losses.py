@@ -1,0 +1,325 @@
+"""How far a picture is from a style, and from what it shows: the thesis's losses, and the ones that train well.
+
+Pictures are (B,3,H,W) sRGB in [0,1]; every loss is a 0-d tensor, the mean over the batch.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from kcam.style.features import SteerableFeatures
+
+FLOOR = 0.1  # of a natural picture's variance: what a flat style is divided by
+DIRECTIONS = 16  # of colour
+TURNS = 4
+COLOUR_FLOOR = 0.05  # least standard deviation that a style's colours are divided by
+FLAT = 1e-3  # local variance of luminance below which a scene's contents count less
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+# ---- the thesis's, eq. 3.10 to 3.13 -------------------------------------------------------------------------------
+
+
+def content_loss(features: Tensor, target: Tensor) -> Tensor:
+    """l_content = ||phi(y) - phi(t)||^2 / (C H W), features (B,C,H,W). Source: eq. 3.10; Johnson et al. (2016)."""
+    return (features - target).square().mean()
+
+
+def gram_matrix(features: Tensor) -> Tensor:
+    """G_cd = sum_hw phi_hwc phi_hwd / (C H W), (B,C,H,W) to (B,C,C). Source: eq. 3.11; Johnson et al. (2016)."""
+    flat = features.flatten(2)
+    return flat @ flat.mT / (flat.shape[1] * flat.shape[2])
+
+
+def gram_loss(gram: Tensor, target: Tensor) -> Tensor:
+    """l_style = ||G(y) - G(t)||_F^2, (B,C,C) or (C,C). Source: eq. 3.12."""
+    return (gram - target).square().sum((-2, -1)).mean()
+
+
+def l2_loss(picture: Tensor, target: Tensor) -> Tensor:
+    """l_l2 = ||y - t||^2 / (C H W). Source: the l_l2 of eq. 3.13; Johnson et al. (2016), pixel loss."""
+    return (picture - target).square().mean()
+
+
+def total_variation(picture: Tensor) -> Tensor:
+    """Mean squared difference of neighbours, down and across. Source: Johnson et al. (2016), after Mahendran (2015)."""
+    down = (picture[..., 1:, :] - picture[..., :-1, :]).square().mean()
+    across = (picture[..., 1:] - picture[..., :-1]).square().mean()
+    return down + across
+
+
+# ---- what trains well ---------------------------------------------------------------------------------------------
+
+
+def moments(features: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (B,C) and centred covariance (B,C,C) of features (B,C,H,W) over the pixels."""
+    flat = features.flatten(2)
+    mean = flat.mean(2)
+    centred = flat - mean[:, :, None]
+    return mean, centred @ centred.mT / flat.shape[2]
+
+
+def moment_loss(
+    mean: Tensor, covariance: Tensor, *, target_mean: Tensor, target_covariance: Tensor, natural: float
+) -> Tensor:
+    """How far mean and covariance are from a style's, relative to how much the style itself varies.
+
+    ||mu - mu_s||^2 / (tr C_s + c v)  +  ||C - C_s||_F^2 / (||C_s||_F^2 + c v^2),   c channels, v = 0.1 natural
+
+    Unlike a Gram matrix it does not weigh the layers by their scale, and a style without contrast stays finite.
+
+    Args:      mean: (B,c).  covariance: (B,c,c).  target_mean: (c,).  target_covariance: (c,c).
+               natural: variance per channel of natural pictures.
+    """
+    channels, floor = len(target_mean), FLOOR * natural
+    of_mean = (mean - target_mean).square().sum(-1) / (target_covariance.trace() + channels * floor)
+    scale = target_covariance.square().sum() + channels * floor**2
+    of_covariance = (covariance - target_covariance).square().sum((-2, -1)) / scale
+    return (of_mean + of_covariance).mean()
+
+
+def colour_directions() -> Tensor:
+    """Directions spread evenly over half of a sphere, (16,3) float64: a Fibonacci lattice."""
+    index = torch.arange(DIRECTIONS, dtype=torch.float64) + 0.5
+    z = 1 - index / DIRECTIONS
+    angle = index * math.pi * (3 - math.sqrt(5))
+    ring = torch.sqrt(1 - z**2)
+    return torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=1)
+
+
+def colour_loss(picture: Tensor, *, directions: Tensor, quantiles: Tensor, deviation: Tensor) -> Tensor:
+    """Sliced Wasserstein distance of the colours: how far pixels must move, seen along some directions.
+
+    mean over directions d of  mean_i |sort(d . x)_i - quantiles_d((i + 1/2) / n)| / deviation_d
+
+    Args:      picture: (B,3,H,W).  directions: (D,3).  quantiles: (D,Q) of the style's projections, ascending.
+               deviation: (D,) of these.
+    Source:    Rabin et al., Wasserstein barycenter and its application to texture mixing (2011).
+    """
+    projected = torch.einsum("dc,bcn->bdn", directions, picture.flatten(2)).sort(-1).values
+    moved = (projected - resampled(quantiles, projected.shape[-1])).abs().mean(-1)
+    return (moved / deviation).mean()
+
+
+def resampled(quantiles: Tensor, count: int) -> Tensor:
+    """Ascending values (D,Q) at the ranks (i + 1/2) / count, (D,count)."""
+    own = quantiles.shape[-1]
+    if own == count:
+        return quantiles
+    place = ((torch.arange(count, device=quantiles.device) + 0.5) * (own / count) - 0.5).clamp(0, own - 1)
+    low = place.long().clamp(max=max(own - 2, 0))
+    share = (place - low).to(quantiles)
+    return quantiles[:, low] * (1 - share) + quantiles[:, (low + 1).clamp(max=own - 1)] * share
+
+
+def luminance(picture: Tensor) -> Tensor:
+    """(B,3,H,W) to (B,1,H,W): the luma of Rec. 709, of coded values."""
+    return torch.einsum("c,bchw->bhw", picture.new_tensor(LUMINANCE), picture)[:, None]
+
+
+def correlation_loss(picture: Tensor, scene: Tensor, *, levels: tuple[int, ...], window: int = 11) -> Tensor:
+    """How much of what the scene shows is lost: local correlation of luminance, blind to colour, not to the sign.
+
+    mean over levels and windows of  w (1 - cov(y, t) / sqrt(var y var t)),   w = var t / (var t + 1e-3)
+
+    A negative scores up to twice as high as a picture that shows nothing. Coarse levels leave room for strokes.
+
+    Args:      picture, scene: (B,3,H,W).  levels: factors by which both are averaged first.  window: side [pixels].
+    """
+    losses = []
+    for level in levels:
+        y, t = (F.avg_pool2d(luminance(x), level) if level > 1 else luminance(x) for x in (picture, scene))
+        side = min(window, *y.shape[-2:])
+        mean_y, mean_t, square_y, square_t, product = F.avg_pool2d(
+            torch.cat([y, t, y * y, t * t, y * t], dim=1), side, stride=1
+        ).split(1, dim=1)
+        var_y = (square_y - mean_y**2).clamp(min=0) + 1e-5
+        var_t = (square_t - mean_t**2).clamp(min=0)
+        correlation = (product - mean_y * mean_t) / (var_y * (var_t + 1e-5)).sqrt()
+        losses.append((var_t / (var_t + FLAT) * (1 - correlation)).mean())
+    return torch.stack(losses).mean()
+
+
+# ---- all together -------------------------------------------------------------------------------------------------
+
+STATISTICS = ("moments", "gram")
+CONTENTS = ("correlation", "features")
+
+
+class StyleLoss(nn.Module):
+    """How far a picture is from a style picture and from what it should show: a weighted sum of named terms.
+
+    total = style L_style + colour L_colour + content L_content + l2 L_l2 + tv L_tv                       (eq. 3.13)
+
+    The style's own side is computed once, here, from crops at the picture's own pixels, which are never shrunk.
+
+    Args:
+        picture: the style, (3,H,W) sRGB in [0,1], at least as large as the features ask.
+        features: a module of layers, such as `SteerableFeatures` (the default) or `VGG16Features`.
+        statistic: "moments" (`moment_loss`) or "gram" (eq. 3.12), the mean and the sum over the layers.
+        content_by: "correlation" (`correlation_loss`), or "features": eq. 3.10 at the layer `content_layer`.
+        style, colour, content, l2, tv: weights; a term of weight 0 is not computed.
+        levels: of the correlation.
+        content_layer: of the features, where content_by is "features".
+        crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
+    Raises:    ValueError for an unknown name, a negative weight, or a style that is too small; TypeError for what is no
+               picture.
+    """
+
+    def __init__(
+        self,
+        picture: Tensor,
+        *,
+        features: nn.Module | None = None,
+        statistic: str = "moments",
+        content_by: str = "correlation",
+        style: float = 1.0,
+        colour: float = 0.5,
+        content: float = 0.2,
+        l2: float = 0.0,
+        tv: float = 0.0,
+        levels: tuple[int, ...] = (1, 2, 4),
+        content_layer: str = "relu3_3",
+        crop: int | None = None,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (("statistic", statistic, STATISTICS), ("content_by", content_by, CONTENTS)):
+            if value not in known:
+                raise ValueError(f"unknown {name} {value!r}; known: {', '.join(known)}.")
+        self.weights = {"style": style, "colour": colour, "content": content, "l2": l2, "tv": tv}
+        for name, weight in self.weights.items():
+            if not 0 <= weight < math.inf:
+                raise ValueError(f"the weight of {name} must be a finite number >= 0, got {weight!r}.")
+        self.features: Any = SteerableFeatures() if features is None else features
+        self.statistic, self.content_by = statistic, content_by
+        self.levels, self.content_layer = tuple(levels), content_layer
+        crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
+        self.crop = crops.shape[-1]
+        with torch.no_grad():
+            self._remember(crops)
+
+    def _remember(self, crops: Tensor) -> None:
+        """The style's own side of each term: pooled over its crops."""
+        projected = torch.einsum("dc,bcn->dbn", colour_directions().to(crops), crops.flatten(2)).flatten(1)
+        self.register_buffer("quantiles", resampled(projected.sort(-1).values, self.crop**2), persistent=False)
+        self.register_buffer("deviation", projected.std(-1).clamp(min=COLOUR_FLOOR), persistent=False)
+        sums: dict[str, list[Tensor]] = {}
+        for crop in crops.split(4):
+            for name, layer in self.features(crop).items():
+                for index, part in enumerate(self._statistics(layer)):
+                    sums.setdefault(f"{name}/{index}", []).append(part)
+        self.targets: dict[str, tuple[Tensor, ...]] = {}
+        for name in dict.fromkeys(key.split("/")[0] for key in sums):
+            if self.statistic == "gram":
+                self.targets[name] = (torch.cat(sums[f"{name}/0"]).mean(0),)
+                continue
+            means, covariances = torch.cat(sums[f"{name}/0"]), torch.cat(sums[f"{name}/1"])
+            mean = means.mean(0)
+            spread = means - mean
+            self.targets[name] = (mean, covariances.mean(0) + spread.T @ spread / len(means))
+
+    def _statistics(self, layer: Tensor) -> tuple[Tensor, ...]:
+        return moments(layer) if self.statistic == "moments" else (gram_matrix(layer),)
+
+    def terms(
+        self,
+        picture: Tensor,
+        scene: Tensor | None = None,
+        *,
+        recorded: tuple[Tensor, Tensor] | None = None,
+        turn: int | None = None,
+    ) -> dict[str, Tensor]:
+        """Each term times its weight, by name; their sum is the loss.
+
+        Args:      picture: (B,3,H,W).  scene: what it should show, (B,3,H,W), for content and, unless `recorded`, l2.
+                   recorded: (y, y_l2) of eq. 3.13's l2 term, such as what a sensor records with and without optics.
+                   turn: colours are compared along 4 of the 16 directions, others at the next turn: a training step's
+                   number. None: along all.
+        Raises:    ValueError where a term lacks what it compares with.
+        """
+        weights = self.weights
+        terms: dict[str, Tensor] = {}
+        layers = self.features(picture) if weights["style"] or self.content_by == "features" else {}
+        if weights["style"]:
+            terms["style"] = weights["style"] * self._style(layers)
+        if weights["colour"]:
+            some = slice(None) if turn is None else slice(turn % TURNS, None, TURNS)
+            terms["colour"] = weights["colour"] * colour_loss(
+                picture,
+                directions=colour_directions().to(picture)[some],
+                quantiles=self.quantiles[some],
+                deviation=self.deviation[some],
+            )
+        if weights["content"]:
+            terms["content"] = weights["content"] * self._content(picture, _given(scene, "content"), layers)
+        if weights["l2"]:
+            pair = (picture, _given(scene, "l2")) if recorded is None else recorded
+            terms["l2"] = weights["l2"] * l2_loss(*pair)
+        if weights["tv"]:
+            terms["tv"] = weights["tv"] * total_variation(picture)
+        return terms
+
+    def forward(self, picture: Tensor, scene: Tensor | None = None) -> Tensor:
+        """The sum of the terms, 0-d. Arguments: as `terms`."""
+        return torch.stack(list(self.terms(picture, scene).values())).sum()
+
+    def _style(self, layers: dict[str, Tensor]) -> Tensor:
+        losses = []
+        for name, target in self.targets.items():
+            own = self._statistics(layers[name])
+            if self.statistic == "gram":
+                losses.append(gram_loss(own[0], target[0].to(own[0])))
+            else:
+                mean, covariance = (value.to(own[0]) for value in target)
+                natural = self.features.natural[name]
+                losses.append(moment_loss(*own, target_mean=mean, target_covariance=covariance, natural=natural))
+        stacked = torch.stack(losses)
+        return stacked.sum() if self.statistic == "gram" else stacked.mean()
+
+    def _content(self, picture: Tensor, scene: Tensor, layers: dict[str, Tensor]) -> Tensor:
+        if self.content_by == "correlation":
+            return correlation_loss(picture, scene, levels=self.levels)
+        with torch.no_grad():
+            target = self.features(scene)[self.content_layer]
+        return content_loss(layers[self.content_layer], target)
+
+
+def style_crops(picture: Tensor, *, side: int | None, multiple: int, least: int, most: int = 64) -> Tensor:
+    """Crops that cover a style picture evenly, (N,3,s,s): at its own pixels, at most `most` of them.
+
+    Raises:    TypeError, ValueError for what is no picture in [0,1], or one that is smaller than the features ask.
+    """
+    if not isinstance(picture, Tensor) or not picture.is_floating_point():
+        got = picture.dtype if isinstance(picture, Tensor) else type(picture).__name__
+        raise TypeError(f"a style is a floating-point picture (3,H,W) in [0,1], got {got}.")
+    if picture.ndim != 3 or picture.shape[0] != 3:
+        raise ValueError(f"a style is one picture (3,H,W), got shape {tuple(picture.shape)}.")
+    low, high = (value.item() for value in picture.detach().aminmax())
+    if not (low >= 0 and high <= 1):
+        raise ValueError(f"a style has values in [0,1], got {low:g} to {high:g}. Use picture.clamp(0, 1), or / 255.")
+    shorter = min(picture.shape[-2:])
+    side = min(side or 128, shorter) // multiple * multiple
+    if side < least:
+        raise ValueError(
+            f"a style of {picture.shape[-2]} x {picture.shape[-1]} is too small: its features need at least {least} "
+            "pixels each way. Use a larger picture, not an enlarged one: strokes are measured in pixels."
+        )
+    counts = [max(1, math.ceil(size / side)) for size in picture.shape[-2:]]
+    while counts[0] * counts[1] > most:
+        counts = [max(1, count - 1) for count in counts]
+    tops, lefts = (
+        torch.linspace(0, size - side, count).round().int().tolist()
+        for size, count in zip(picture.shape[-2:], counts, strict=True)
+    )
+    return torch.stack([picture[:, top : top + side, left : left + side] for top in tops for left in lefts])
+
+
+def _given(scene: Tensor | None, term: str) -> Tensor:
+    if scene is None:
+        raise ValueError(f"the {term} term compares with a scene, and none was given. Pass scene=, or {term}=0.")
+    return scene

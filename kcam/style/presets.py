@@ -1,0 +1,130 @@
+"""Named ways to train a camera per style: the camera, the loss and the settings of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcam import isp, optics, sensor
+from kcam.camera import Camera
+from kcam.context import Context
+from kcam.style.losses import StyleLoss
+from kcam.style.training import Settings
+from kcam.units import mm, nm, um
+
+DOE_SIDE = 64
+DOE_START = 0.05  # RMS of the phase at the start [rad]: flat is a saddle for all even aberrations
+
+
+def style_camera(*, stage: bool = True) -> Camera:
+    """A camera to train, which takes an ordinary picture: 50 mm f/10 with a DOE, Bayer mosaic, bilinear demosaic.
+
+    What trains: the phase of a 64 x 64 DOE, the curves of the filter (at a Nikon 5100's, non-negative), a 3 x 3
+    convolution behind the demosaic (at the identity), the gains and the colour matrix (at the as-shot ones), and with
+    `stage` a `StyleStage` at the end. The PSF has 12 wavelengths for any number of bands, and 41 x 41 pixels.
+    """
+    curves = sensor.ColourFilter.nikon()
+    context = Context(colour_filter=curves)
+    gains, matrix = isp.as_shot_gains(context).float(), isp.as_shot_colour_matrix(context).float()
+    lens = optics.Lens(
+        optics.CircularAperture(diameter=5 * mm),
+        optics.ThinLens(focal_length=50 * mm),
+        optics.DOE(nn.Parameter(smooth_phase(DOE_SIDE)), design_wavelength=550 * nm, glass="fused silica"),
+        focus_distance=2.0,
+    )
+    return Camera(
+        optics.Imaging(lens, pixel_pitch=4 * um, psf_shape=(41, 41), bands=12),
+        curves.trainable(),
+        sensor.Mosaic("RGGB"),
+        sensor.Exposure(),
+        sensor.ShotNoise(full_well=10_000),
+        sensor.ReadNoise(3.0),
+        sensor.ADC(bits=12),
+        isp.Demosaic("bilinear", gains=gains),
+        isp.Convolution(),
+        isp.WhiteBalance(nn.Parameter(gains)),
+        isp.ColourMatrix(nn.Parameter(matrix)),
+        isp.ToneCurve(),
+        *([isp.StyleStage()] if stage else []),
+    )
+
+
+def smooth_phase(side: int) -> Tensor:
+    """A smooth phase map of 0.05 rad RMS, (side, side), the same every time: a few low cosines.
+
+    A flat map is a saddle: by symmetry the gradient of every even aberration starts at 0.
+    """
+    place = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+    waves = torch.cos(math.pi * torch.arange(4)[:, None] * place)
+    seeded = torch.Generator("cpu").manual_seed(0)
+    weights = torch.randn(4, 4, generator=seeded, dtype=torch.float64, device="cpu")
+    weights[0, 0] = 0
+    phase = waves.T @ weights @ waves
+    return (DOE_START * phase / phase.square().mean().sqrt()).float()
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A way to train. note: for the help. camera: makes it. loss: arguments of `StyleLoss`. settings: of `fit`.
+
+    epochs: where it is these that are given, not the steps.
+    """
+
+    note: str
+    camera: Callable[..., Camera]
+    loss: dict[str, Any]
+    settings: Settings
+    epochs: int | None = None
+
+    def style_loss(self, picture: Tensor, *, features: nn.Module | None = None, **changes: Any) -> StyleLoss:
+        """The loss for a style picture, with some of its arguments changed."""
+        how = self.loss | changes
+        if features is not None and features.name != "steerable":
+            how = {"content_by": "features", "content_layer": "relu3_3"} | how
+        return StyleLoss(picture, features=features, crop=self.settings.size, **how)
+
+    def for_scenes(self, count: int, **changes: Any) -> Settings:
+        """The settings for so many training scenes, some of them changed."""
+        settings = self.settings
+        if self.epochs is not None:
+            settings = replace(settings, steps=self.epochs * math.ceil(count / settings.batch))
+        return replace(settings, **changes)
+
+
+PRESETS: dict[str, Preset] = {
+    "quick": Preset(
+        "built-in scenes, 128 pixels: minutes on a laptop",
+        style_camera,
+        {"content": 0.3, "levels": (2, 4, 8)},
+        Settings(steps=600),
+    ),
+    "standard": Preset(
+        "256 pixels, more steps: half an hour on a CPU, a minute on a GPU",
+        style_camera,
+        {"content": 0.3, "levels": (2, 4, 8)},
+        Settings(steps=1000, size=256),
+    ),
+    "thesis": Preset(
+        "the thesis's network and settings, its table 4.1: batch 2, 50 epochs, Adam",
+        Camera.thesis,
+        {"statistic": "gram", "colour": 0.0, "content": 0.0, "l2": 1.0},
+        Settings(
+            size=256,
+            rates={"optics": 1e-3, "filter": 1e-3, "demosaic": 1e-3},
+            betas=(0.5, 0.999),
+            weight_decay=1e-4,
+            decayed=("optics", "filter", "demosaic"),
+            warm_up=0,
+            final=1.0,
+            clip=math.inf,
+            average=0.0,
+            every=500,
+        ),
+        epochs=50,
+    ),
+}
