@@ -1,0 +1,1 @@
+"""Cameras that learn a painting's style."""
