@@ -7,12 +7,14 @@ like any other, so that the statistics of a style mean something. All four wrap 
 from __future__ import annotations
 
 from collections.abc import Callable
+from zlib import crc32
 
 import numpy as np
 import torch
 from numpy.random import Generator, Philox
 from scipy import fft
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 Array = np.ndarray
@@ -31,6 +33,30 @@ NIGHT = (
     (0.00, "#101c55"), (0.14, "#1a2f86"), (0.27, "#2148ab"), (0.40, "#2f6cc4"), (0.54, "#4b9bd0"), (0.66, "#7fc3d2"),
     (0.75, "#bfdcc4"), (0.81, "#f5ebc2"), (0.88, "#f6cb45"), (0.95, "#e6952a"),
 )  # fmt: skip
+
+BAND = 84.0  # pixels from one band of colour to the next
+STONE, GROUT, LLOYD = 7.0, 1.0, 5  # pixels of a side, of a joint; steps that even the stones out
+JOINT = "#6b6052"
+FLOOR = (
+    (0.00, "#1f5b61"), (0.15, "#3b8a86"), (0.28, "#8fb8a4"), (0.36, "#4a2c22"), (0.41, "#f1e6c8"), (0.56, "#e2c688"),
+    (0.67, "#d09a3e"), (0.77, "#c2623a"), (0.90, "#8f3324"),
+)  # fmt: skip
+
+WAVE = 88.0  # pixels from crest to crest
+LINE, COMBS, TURNS = 6.5, 4, 12  # pixels from line to line; rounds of combing, directions of the comb
+OUTLINE = 2.2  # pixels
+KEY = "#131b3a"
+INKS = ((0.0, "#1d2f63"), (0.22, "#2f5d8f"), (0.42, "#9db9bd"), (0.56, "#efe3c6"), (0.86, "#c9472b"))
+CUTS = ((0.0, "#b9cdc9"), (0.22, "#131b3a"), (0.42, "#2f5d8f"), (0.56, "#24406f"), (0.86, "#4a1620"))  # lines on them
+
+POOL, TOOTH = 100.0, 4.5  # pixels from pool to pool of colour, and from grain to grain of the paper
+RIM = 0.55  # pigment that gathers where a pool dries
+PAPER, INK = "#f8f1e6", "#2b1f3d"
+GLAZES = (
+    ("#f2b8b5", 0.55), ("#a9c98f", 0.40), ("#c3a5d6", 0.40), ("#d6527f", 0.26), ("#5f9a63", 0.26), ("#7a4fa3", 0.24),
+    ("#2f6b58", 0.12), ("#a3195b", 0.10),
+)  # fmt: skip
+SPLASHES = 1 / 900  # drops to a pixel
 
 
 def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> Tensor:
@@ -51,7 +77,7 @@ def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> 
         raise ValueError(f"size {size} of a style picture: expected a side or (height, width), {LEAST} to {MOST} pixels each. Try size=512.")
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed {seed} of a style picture: expected 0 to 2**63 - 1. Try seed=0.")
-    picture = STYLES[name](shape, Generator(Philox(key=seed)))
+    picture = STYLES[name](shape, Generator(Philox(key=[seed, crc32(name.encode())])))
     levels = np.rint(255 * np.clip(picture, 0, 1)).astype(np.float32)
     return torch.from_numpy(np.ascontiguousarray(levels.transpose(2, 0, 1)) / np.float32(255))
 
@@ -93,6 +119,137 @@ def _stroke(canvas, height, centre, tangent, bend, length, width, colour, rng) -
     canvas[box] += cover[..., None] * (paint - canvas[box])
     ridge = 1 - 0.5 * (across / (half + 0.5)) ** 2 + 0.35 * comb
     height[box] += cover * (ridge - height[box])
+
+
+def mosaic(shape: tuple[int, int], rng: Generator) -> Array:
+    """Small stones laid in rows along bands of colour: a Roman floor."""
+    bands = _noise(shape, rng, BAND)
+    tangent = _along(bands)
+    stone, edge = _stones(shape, tangent, rng)
+    count = stone.max() + 1
+    size = np.maximum(np.bincount(stone.ravel(), minlength=count), 1)
+    tone = np.bincount(stone.ravel(), _ranks(bands).ravel(), minlength=count) / size
+    worn = rng.normal(0, (0.07, 0.07), (count, 2))
+    stones = _colour(FLOOR, tone + rng.normal(0, 0.012, count))
+    stones = stones * (1 + worn[:, :1]) + worn[:, 1:] * (0.4, 0.1, -0.4)
+    height = np.clip(edge / 1.6, 0, 1) + gaussian_filter(rng.normal(0, 0.5, shape), 0.8, mode="wrap")
+    joint = np.clip(edge - GROUT / 2, 0, 1)[..., None]
+    return _lit(_rgb(JOINT) * (1 - joint) + stones[stone] * joint, height)
+
+
+def _stones(shape: tuple[int, int], tangent: Array, rng: Generator) -> tuple[Array, Array]:
+    """Each pixel's stone, and its distance to the next stone [pixels].
+
+    Square cells turned along the tangent, evened out by Lloyd's steps (Hausner, Simulating decorative mosaics, 2001).
+    """
+    side = np.array(shape)
+    count = [max(1, round(n / STONE)) for n in shape]
+    start = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), -1).reshape(-1, 2)
+    centres = (start + rng.random(start.shape)) * side / count
+    pixels = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
+    for _ in range(LLOYD):
+        tree = cKDTree(centres % side, boxsize=side)
+        near = tree.query(pixels, k=6)[1]
+        axis = tangent[:, *(tree.data.astype(int) % side).T][:, near]
+        step = (pixels[:, None] - tree.data[near] + side / 2) % side - side / 2
+        far = np.maximum(
+            abs(step[..., 1] * axis[0] + step[..., 0] * axis[1]), abs(step[..., 0] * axis[0] - step[..., 1] * axis[1])
+        )
+        order = np.argpartition(far, 1, axis=1)[:, :2]
+        first, second = np.take_along_axis(far, order, 1).T
+        stone = np.take_along_axis(near, order[:, :1], 1)[:, 0]
+        step = np.take_along_axis(step, order[:, :1, None], 1)[:, 0]
+        size = np.maximum(np.bincount(stone, minlength=len(centres)), 1)
+        shift = np.stack([np.bincount(stone, step[:, k], minlength=len(centres)) / size for k in (0, 1)], -1)
+        centres = tree.data + shift
+    return stone.reshape(shape), (second - first).reshape(shape) / 2
+
+
+def woodcut(shape: tuple[int, int], rng: Generator) -> Array:
+    """Lines cut along the waves, over flat inks with dark outlines: a coloured woodblock print after Hokusai."""
+    waves = _noise(shape, rng, WAVE)
+    tangent = _along(waves, drift=DRIFT)
+    tone = _ranks(waves)
+    lines = _lines(shape, tangent, rng)
+    picture = _colour(INKS, tone)
+    # Swelling lines: a cutter shades each form from one side, and leaves the other clear.
+    start, end = np.array([start for start, _ in INKS] + [1.0])[_index(INKS, tone)[None] + [[[0]], [[1]]]]
+    shading = 1.0 - 1.1 * (tone - start) / (end - start) + 0.25 * _noise(shape, rng, WAVE / 2)
+    cut = _step(lines - 0.75 + shading, 0.5)[..., None]
+    picture = picture + cut * (_colour(CUTS, tone) - picture)
+    slope = np.hypot(*_gradient(tone)) + 1e-4
+    distance = np.min([abs(tone - start) for start, _ in INKS[1:]], axis=0) / slope
+    swell = OUTLINE * (1 + 0.4 * _noise(shape, rng, 24))
+    outline = np.clip(swell / 2 - distance + 0.5, 0, 1)[..., None]
+    picture = picture + outline * (_rgb(KEY) - picture)
+    grain = gaussian_filter(rng.standard_normal(shape), (0.7, 9), mode="wrap")
+    return picture * (1 + 0.03 * grain / grain.std())[..., None] + 0.012 * rng.standard_normal((*shape, 1))
+
+
+def _lines(shape: tuple[int, int], tangent: Array, rng: Generator) -> Array:
+    """-1 to 1 across near-parallel lines that follow the tangent: noise, combed over and over by turned filters."""
+    fy, fx = fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :]
+    with np.errstate(divide="ignore"):
+        band = np.exp(-(np.log2(np.hypot(fy, fx) * LINE) ** 2) / (2 * 0.3**2))
+    across = np.arctan2(fx, -fy)  # a wave's lines run at right angles to its frequency
+    along = np.arctan2(tangent[1], tangent[0])
+    field = rng.standard_normal(shape)
+    for _ in range(COMBS):
+        spectrum, combed = fft.rfft2(field) * band, np.zeros(shape)
+        for angle in np.arange(TURNS) * np.pi / TURNS:
+            response = fft.irfft2(spectrum * np.exp(-(_turned(across - angle) ** 2) / (2 * 0.22**2)), s=shape)
+            combed += response * np.clip(1 - abs(_turned(along - angle)) * TURNS / np.pi, 0, 1)
+        field = np.tanh(2 * combed / combed.std())
+    return field
+
+
+def _turned(angle: Array) -> Array:
+    """The angle between two lines, -pi/2 to pi/2."""
+    return (angle + np.pi / 2) % np.pi - np.pi / 2
+
+
+def _step(value: Array, width: float) -> Array:
+    """0 to 1 around 0, smoothly."""
+    t = np.clip(value / width + 0.5, 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def watercolour(shape: tuple[int, int], rng: Generator) -> Array:
+    """Glazes with dark rims that dried one over the other on rough paper, ink lines and splashes: a wet garden."""
+    tooth = _noise(shape, rng, TOOTH, octaves=0.6)
+    picture = np.broadcast_to(_rgb(PAPER), (*shape, 3))
+    for pigment, share in GLAZES:
+        pool = _noise(shape, rng, POOL) + 0.3 * _noise(shape, rng, POOL / 3) + 0.06 * _noise(shape, rng, POOL / 9)
+        inside = _distance(pool, 1 - share)
+        wash = 0.55 + 0.25 * np.clip(_noise(shape, rng, POOL / 2), -1.5, 1.5) + 0.13 * tooth
+        rim = RIM * np.exp(-np.maximum(inside, 0) / 2)
+        picture = picture * _rgb(pigment) ** (_step(inside, 2.0) * np.maximum(wash + rim, 0.1))[..., None]
+    pen = _noise(shape, rng, POOL, octaves=0.5) + 0.15 * _noise(shape, rng, POOL / 5)
+    pressure = 0.8 + 0.9 * _noise(shape, rng, POOL / 2)
+    ink = np.clip(pressure - abs(_distance(pen, 0.5)) + 0.5, 0, 1)
+    splashes = _splashes(shape, rng)
+    picture = picture * _rgb(INK) ** np.maximum(0.9 * ink, splashes)[..., None]
+    return picture * (1 + 0.035 * (tooth - np.roll(tooth, (1, 1), (0, 1))))[..., None]
+
+
+def _splashes(shape: tuple[int, int], rng: Generator) -> Array:
+    """Drops of ink, many small and few large."""
+    cover = np.zeros(shape)
+    steps = np.arange(-6, 7)
+    for _ in range(round(SPLASHES * shape[0] * shape[1])):
+        row, column = rng.integers(shape)
+        radius, squash, angle = 0.6 + rng.exponential(0.9), rng.uniform(1, 1.5), rng.uniform(0, np.pi)
+        u = np.cos(angle) * steps + np.sin(angle) * steps[:, None]
+        v = np.cos(angle) * steps[:, None] - np.sin(angle) * steps
+        box = np.ix_((row + steps) % shape[0], (column + steps) % shape[1])
+        cover[box] = np.maximum(cover[box], np.clip(min(radius, 4.5) - np.hypot(u / squash, v * squash) + 0.5, 0, 1))
+    return cover
+
+
+def _distance(field: Array, level: float) -> Array:
+    """How far inside the contour above which the field's share 1 - level lies [pixels], to first order."""
+    ranks = _ranks(field)
+    return (ranks - level) / (np.hypot(*_gradient(ranks)) + 2e-3)
 
 
 def _lit(canvas: Array, height: Array) -> Array:
@@ -142,10 +299,13 @@ def _rgb(code: str) -> Array:
     return np.array([int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)])
 
 
+def _index(palette: tuple[tuple[float, str], ...], tone: Array) -> Array:
+    return np.clip(np.searchsorted([start for start, _ in palette], tone, side="right") - 1, 0, None)
+
+
 def _colour(palette: tuple[tuple[float, str], ...], tone: Array) -> Array:
     """The palette's colours at tones 0 to 1, each from its own tone upwards."""
-    index = np.searchsorted([start for start, _ in palette], tone, side="right") - 1
-    return np.stack([_rgb(code) for _, code in palette])[np.clip(index, 0, None)]
+    return np.stack([_rgb(code) for _, code in palette])[_index(palette, tone)]
 
 
-STYLES: dict[str, Callable[[tuple[int, int], Generator], Array]] = {"strokes": strokes}
+STYLES: dict[str, Callable[[tuple[int, int], Generator], Array]] = {"strokes": strokes, "mosaic": mosaic, "woodcut": woodcut, "watercolour": watercolour}
