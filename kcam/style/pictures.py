@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 Array = np.ndarray
-LEAST, MOST = 64, 8192  # pixels of a side: below, a stroke meets itself around the border
-NEIGHBOURHOOD = 50.0  # pixels (sigma) over which the palette is used up: a 256-pixel crop holds a few
+LEAST, MOST = 64, 2048  # pixels of a side: below, a stroke meets itself around the border; above, memory
+NEIGHBOURHOOD = 40.0  # pixels (sigma) over which the palette is used up: a 256-pixel crop holds a few
 
-SWIRL = 72.0  # pixels from one swirl to the next
+SWIRL = 66.0  # pixels from one swirl to the next
 STROKE_LENGTH, STROKE_WIDTH = (14.0, 38.0), (3.2, 6.6)  # pixels
 STROKE_LAYERS = 4.0  # strokes over each pixel, on average
 BEND, TURN = 1 / 12, 1.4  # a stroke's strongest curvature [1/pixel], and how far it turns [rad]
@@ -42,20 +42,19 @@ FLOOR = (
     (0.67, "#d09a3e"), (0.77, "#c2623a"), (0.90, "#8f3324"),
 )  # fmt: skip
 
-WAVE = 88.0  # pixels from crest to crest
+WAVE = 78.0  # pixels from crest to crest
 LINE, COMBS, TURNS = 6.5, 4, 12  # pixels from line to line; rounds of combing, directions of the comb
 OUTLINE = 2.2  # pixels
 KEY = "#131b3a"
 INKS = ((0.0, "#1d2f63"), (0.22, "#2f5d8f"), (0.42, "#9db9bd"), (0.56, "#efe3c6"), (0.86, "#c9472b"))
 CUTS = ((0.0, "#b9cdc9"), (0.22, "#131b3a"), (0.42, "#2f5d8f"), (0.56, "#24406f"), (0.86, "#4a1620"))  # lines on them
 
-POOL, TOOTH = 100.0, 4.5  # pixels from pool to pool of colour, and from grain to grain of the paper
-RIM = 0.55  # pigment that gathers where a pool dries
+POOL, TOOTH = 92.0, 4.5  # pixels from pool to pool of colour, and from grain to grain of the paper
+RIM = 0.6  # pigment that gathers where a pool dries
 PAPER, INK = "#f8f1e6", "#2b1f3d"
 GLAZES = (
-    ("#f2b8b5", 0.55), ("#a9c98f", 0.40), ("#c3a5d6", 0.40), ("#d6527f", 0.26), ("#5f9a63", 0.26), ("#7a4fa3", 0.24),
-    ("#2f6b58", 0.12), ("#a3195b", 0.10),
-)  # fmt: skip
+    (0.36, "#f7bdb4", "#bcd79f"), (0.30, "#cdb4e3", "#f6e0b4"), (0.20, "#e0527f", "#62a66c"), (0.13, "#7648ab", "#2f8577"),
+)  # each pigment's share of the picture; the two of a row, which would turn to mud, never meet  # fmt: skip
 SPLASHES = 1 / 900  # drops to a pixel
 
 
@@ -63,7 +62,7 @@ def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> 
     """A style picture, painted by rule and chance.
 
     Args:      name: a key of `STYLES`.
-               size: side, or (height, width) [pixels], each 64 to 8192; the strokes keep their size.
+               size: side, or (height, width) [pixels], each 64 to 2048; the strokes keep their size.
                seed: of all that is left to chance, 0 or more.
     Returns:   float32 (3, H, W), sRGB in [0, 1], in steps of 1/255: an 8-bit file holds the same picture.
     Raises:    ValueError for an unknown name, a size or a seed out of range.
@@ -71,10 +70,13 @@ def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> 
     torch.Size([3, 64, 96])
     """
     if name not in STYLES:
-        raise ValueError(f'unknown style picture "{name}": expected one of {", ".join(STYLES)}. Try "{next(iter(STYLES))}".')
-    shape = (size, size) if isinstance(size, int) else tuple(size)
+        raise ValueError(f'unknown style picture "{name}": expected one of {", ".join(STYLES)}. Try "strokes".')
+    shape = (size, size) if isinstance(size, int) else size
     if len(shape) != 2 or not all(isinstance(side, int) and LEAST <= side <= MOST for side in shape):
-        raise ValueError(f"size {size} of a style picture: expected a side or (height, width), {LEAST} to {MOST} pixels each. Try size=512.")
+        raise ValueError(
+            f"size {size} of a style picture: expected a side or (height, width), {LEAST} to {MOST} whole pixels each. "
+            "Try size=512."
+        )
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed {seed} of a style picture: expected 0 to 2**63 - 1. Try seed=0.")
     picture = STYLES[name](shape, Generator(Philox(key=[seed, crc32(name.encode())])))
@@ -95,30 +97,32 @@ def strokes(shape: tuple[int, int], rng: Generator) -> Array:
     colours[accent] = _colour(NIGHT, rng.random(int(accent.sum())))
     canvas, height = _colour(NIGHT, tone), np.zeros(shape)
     for row, column, colour in zip(rows, columns, colours, strict=True):
-        length, width = rng.uniform(*STROKE_LENGTH), rng.uniform(*STROKE_WIDTH)
-        length = min(length, TURN / (abs(bend[row, column]) + 1e-3))
-        _stroke(canvas, height, (row, column), tangent[:, row, column], bend[row, column], length, width, colour, rng)
+        turn = bend[row, column]
+        length = min(rng.uniform(*STROKE_LENGTH), TURN / (abs(turn) + 1e-3))
+        width = rng.uniform(*STROKE_WIDTH)
+        reach = int((length + width) / 2) + 1
+        steps = np.arange(-reach, reach + 1)
+        cover, shade, ridge = _stroke(steps, length, width, tangent[:, row, column], turn, rng)
+        paint = colour + shade[..., None] * (colour + 0.2)
+        box = np.ix_((row + steps) % shape[0], (column + steps) % shape[1])
+        canvas[box] += cover[..., None] * (paint - canvas[box])
+        height[box] += cover * (ridge - height[box])
     return _lit(canvas, height)
 
 
-def _stroke(canvas, height, centre, tangent, bend, length, width, colour, rng) -> None:
-    """One stroke, in place: opaque, round where it starts, thin where it ends, combed by the bristles."""
-    reach = int(length / 2 + width / 2) + 1
-    steps = np.arange(-reach, reach + 1)
+def _stroke(
+    steps: Array, length: float, width: float, tangent: Array, bend: float, rng: Generator
+) -> tuple[Array, Array, Array]:
+    """Cover, shade and height of one stroke: round where it starts, thin where it ends, combed by the bristles."""
     y, x = steps[:, None], steps[None, :]
     along = x * tangent[0] + y * tangent[1]
     across = y * tangent[0] - x * tangent[1] - bend * along**2 / 2
     t = np.clip(along / length + 0.5, 0, 1)
     half = width / 2 * np.minimum(1, 2.2 * np.sqrt(t)) * np.sqrt(1 - t**3)
-    cover = np.clip(half - np.abs(across) + 0.5, 0, 1) * (np.abs(along) < length / 2)
-    hairs = rng.normal(0, 1, 12)
-    comb = np.interp(across, np.linspace(-6, 6, 12), hairs)
+    cover = np.clip(half - abs(across) + 0.5, 0, 1) * (abs(along) < length / 2)
+    comb = np.interp(across, np.linspace(-6, 6, 12), rng.normal(0, 1, 12))
     shade = np.clip(BRISTLES * comb, -0.3, 0.3) + rng.normal(0, JITTER)
-    paint = colour + shade[..., None] * (colour + 0.2)
-    box = np.ix_((centre[0] + steps) % canvas.shape[0], (centre[1] + steps) % canvas.shape[1])
-    canvas[box] += cover[..., None] * (paint - canvas[box])
-    ridge = 1 - 0.5 * (across / (half + 0.5)) ** 2 + 0.35 * comb
-    height[box] += cover * (ridge - height[box])
+    return cover, shade, 1 - 0.5 * (across / (half + 0.5)) ** 2 + 0.35 * comb
 
 
 def mosaic(shape: tuple[int, int], rng: Generator) -> Array:
@@ -148,9 +152,10 @@ def _stones(shape: tuple[int, int], tangent: Array, rng: Generator) -> tuple[Arr
     centres = (start + rng.random(start.shape)) * side / count
     pixels = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
     for _ in range(LLOYD):
-        tree = cKDTree(centres % side, boxsize=side)
+        centres = centres % side
+        tree = cKDTree(np.where(centres < side, centres, 0.0), boxsize=side)  # -1e-17 % side is side itself
         near = tree.query(pixels, k=6)[1]
-        axis = tangent[:, *(tree.data.astype(int) % side).T][:, near]
+        axis = tangent[:, *tree.data.astype(int).T][:, near]
         step = (pixels[:, None] - tree.data[near] + side / 2) % side - side / 2
         far = np.maximum(
             abs(step[..., 1] * axis[0] + step[..., 0] * axis[1]), abs(step[..., 0] * axis[0] - step[..., 1] * axis[1])
@@ -173,12 +178,13 @@ def woodcut(shape: tuple[int, int], rng: Generator) -> Array:
     lines = _lines(shape, tangent, rng)
     picture = _colour(INKS, tone)
     # Swelling lines: a cutter shades each form from one side, and leaves the other clear.
-    start, end = np.array([start for start, _ in INKS] + [1.0])[_index(INKS, tone)[None] + [[[0]], [[1]]]]
-    shading = 1.0 - 1.1 * (tone - start) / (end - start) + 0.25 * _noise(shape, rng, WAVE / 2)
+    starts, ink = np.array([*(start for start, _ in INKS), 1.0]), _index(INKS, tone)
+    across = (tone - starts[ink]) / (starts[ink + 1] - starts[ink])
+    shading = 1.0 - 1.1 * across + 0.25 * _noise(shape, rng, WAVE / 2)
     cut = _step(lines - 0.75 + shading, 0.5)[..., None]
     picture = picture + cut * (_colour(CUTS, tone) - picture)
     slope = np.hypot(*_gradient(tone)) + 1e-4
-    distance = np.min([abs(tone - start) for start, _ in INKS[1:]], axis=0) / slope
+    distance = np.min([abs(tone - start) for start in starts[1:-1]], axis=0) / slope
     swell = OUTLINE * (1 + 0.4 * _noise(shape, rng, 24))
     outline = np.clip(swell / 2 - distance + 0.5, 0, 1)[..., None]
     picture = picture + outline * (_rgb(KEY) - picture)
@@ -218,12 +224,13 @@ def watercolour(shape: tuple[int, int], rng: Generator) -> Array:
     """Glazes with dark rims that dried one over the other on rough paper, ink lines and splashes: a wet garden."""
     tooth = _noise(shape, rng, TOOTH, octaves=0.6)
     picture = np.broadcast_to(_rgb(PAPER), (*shape, 3))
-    for pigment, share in GLAZES:
+    for share, *pair in GLAZES:
         pool = _noise(shape, rng, POOL) + 0.3 * _noise(shape, rng, POOL / 3) + 0.06 * _noise(shape, rng, POOL / 9)
-        inside = _distance(pool, 1 - share)
-        wash = 0.55 + 0.25 * np.clip(_noise(shape, rng, POOL / 2), -1.5, 1.5) + 0.13 * tooth
-        rim = RIM * np.exp(-np.maximum(inside, 0) / 2)
-        picture = picture * _rgb(pigment) ** (_step(inside, 2.0) * np.maximum(wash + rim, 0.1))[..., None]
+        for pigment, side in zip(pair, (pool, -pool), strict=True):
+            inside = _distance(side, 1 - share)
+            wash = 0.55 + 0.25 * np.clip(_noise(shape, rng, POOL / 2), -1.5, 1.5) + 0.13 * tooth
+            rim = RIM * np.exp(-np.maximum(inside, 0) / 2)
+            picture = picture * _rgb(pigment) ** (_step(inside, 2.0) * np.maximum(wash + rim, 0.1))[..., None]
     pen = _noise(shape, rng, POOL, octaves=0.5) + 0.15 * _noise(shape, rng, POOL / 5)
     pressure = 0.8 + 0.9 * _noise(shape, rng, POOL / 2)
     ink = np.clip(pressure - abs(_distance(pen, 0.5)) + 0.5, 0, 1)
@@ -258,7 +265,7 @@ def _lit(canvas: Array, height: Array) -> Array:
     return canvas * (1 + RELIEF * np.clip(slope, -1, 1))[..., None]
 
 
-def _noise(shape: tuple[int, int], rng: Generator, wavelength: float, *, octaves: float = 0.35) -> Array:
+def _noise(shape: tuple[int, int], rng: Generator, wavelength: float, *, octaves: float = 0.3) -> Array:
     """Isotropic periodic noise of unit variance around one wavelength: nothing slower, so that all crops look alike."""
     frequency = np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :])
     with np.errstate(divide="ignore"):
