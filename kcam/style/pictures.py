@@ -7,6 +7,7 @@ like any other, so that the statistics of a style mean something. All four wrap 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from zlib import crc32
 
 import numpy as np
@@ -17,10 +18,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from kcam.style import fields
+
 Array = np.ndarray
 LEAST, MOST = 64, 2048  # pixels of a side: below, a stroke meets itself around the border; above, memory
-NEIGHBOURHOOD = 40.0  # pixels (sigma) over which the palette is used up: a 256-pixel crop holds a few
-
 SWIRL = 66.0  # pixels from one swirl to the next
 STROKE_LENGTH, STROKE_WIDTH = (14.0, 38.0), (3.2, 6.6)  # pixels
 STROKE_LAYERS = 4.0  # strokes over each pixel, on average
@@ -35,7 +36,7 @@ NIGHT = (
 )  # fmt: skip
 
 BAND = 84.0  # pixels from one band of colour to the next
-STONE, GROUT, LLOYD = 7.0, 1.0, 5  # pixels of a side, of a joint; steps that even the stones out
+STONE, GROUT, LLOYD = 7.0, 0.8, 5  # pixels of a side, of a joint; steps that even the stones out
 JOINT = "#6b6052"
 FLOOR = (
     (0.00, "#1f5b61"), (0.15, "#3b8a86"), (0.28, "#8fb8a4"), (0.36, "#4a2c22"), (0.41, "#f1e6c8"), (0.56, "#e2c688"),
@@ -52,9 +53,10 @@ CUTS = ((0.0, "#b9cdc9"), (0.22, "#131b3a"), (0.42, "#2f5d8f"), (0.56, "#24406f"
 POOL, TOOTH = 92.0, 4.5  # pixels from pool to pool of colour, and from grain to grain of the paper
 RIM = 0.6  # pigment that gathers where a pool dries
 PAPER, INK = "#f8f1e6", "#2b1f3d"
-GLAZES = (
-    (0.36, "#f7bdb4", "#bcd79f"), (0.30, "#cdb4e3", "#f6e0b4"), (0.20, "#e0527f", "#62a66c"), (0.13, "#7648ab", "#2f8577"),
-)  # each pigment's share of the picture; the two of a row, which would turn to mud, never meet  # fmt: skip
+GLAZES = (  # each pigment's share of the picture; the two of a row, which would turn to mud, never meet
+    (0.36, "#f7bdb4", "#bcd79f"), (0.30, "#cdb4e3", "#f6e0b4"),
+    (0.20, "#e0527f", "#62a66c"), (0.13, "#7648ab", "#2f8577"),
+)  # fmt: skip
 SPLASHES = 1 / 900  # drops to a pixel
 
 
@@ -86,16 +88,16 @@ def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> 
 
 def strokes(shape: tuple[int, int], rng: Generator) -> Array:
     """Thick, tapered strokes of oil that follow swirls: a night sky in the manner of van Gogh."""
-    sky = _noise(shape, rng, SWIRL)
-    tangent = _along(sky, drift=DRIFT)
-    bend = np.clip(_curvature(tangent), -BEND, BEND)
-    tone = _ranks(sky + PATCHES * _noise(shape, rng, SWIRL))
+    sky = fields.noise(shape, rng, SWIRL)
+    tangent = fields.along(sky, drift=DRIFT)
+    bend = np.clip(fields.curvature(tangent), -BEND, BEND)
+    tone = fields.ranks(sky + PATCHES * fields.noise(shape, rng, SWIRL))
     count = round(STROKE_LAYERS * shape[0] * shape[1] / (np.mean(STROKE_LENGTH) * np.mean(STROKE_WIDTH)))
     rows, columns = (rng.integers(side, size=count) for side in shape)
-    colours = _colour(NIGHT, tone[rows, columns] + rng.normal(0, TONES, count))
+    colours = fields.colours(NIGHT, tone[rows, columns] + rng.normal(0, TONES, count))
     accent = rng.random(count) < ACCENTS
-    colours[accent] = _colour(NIGHT, rng.random(int(accent.sum())))
-    canvas, height = _colour(NIGHT, tone), np.zeros(shape)
+    colours[accent] = fields.colours(NIGHT, rng.random(int(accent.sum())))
+    canvas, relief = fields.colours(NIGHT, tone), np.zeros(shape)
     for row, column, colour in zip(rows, columns, colours, strict=True):
         turn = bend[row, column]
         length = min(rng.uniform(*STROKE_LENGTH), TURN / (abs(turn) + 1e-3))
@@ -103,11 +105,11 @@ def strokes(shape: tuple[int, int], rng: Generator) -> Array:
         reach = int((length + width) / 2) + 1
         steps = np.arange(-reach, reach + 1)
         cover, shade, ridge = _stroke(steps, length, width, tangent[:, row, column], turn, rng)
-        paint = colour + shade[..., None] * (colour + 0.2)
+        paint = colour + shade[..., None] * (0.85 * colour + 0.12)
         box = np.ix_((row + steps) % shape[0], (column + steps) % shape[1])
         canvas[box] += cover[..., None] * (paint - canvas[box])
-        height[box] += cover * (ridge - height[box])
-    return _lit(canvas, height)
+        relief[box] += cover * (ridge - relief[box])
+    return _lit(canvas, relief)
 
 
 def _stroke(
@@ -127,18 +129,18 @@ def _stroke(
 
 def mosaic(shape: tuple[int, int], rng: Generator) -> Array:
     """Small stones laid in rows along bands of colour: a Roman floor."""
-    bands = _noise(shape, rng, BAND)
-    tangent = _along(bands)
+    bands = fields.noise(shape, rng, BAND)
+    tangent = fields.along(bands)
     stone, edge = _stones(shape, tangent, rng)
     count = stone.max() + 1
-    size = np.maximum(np.bincount(stone.ravel(), minlength=count), 1)
-    tone = np.bincount(stone.ravel(), _ranks(bands).ravel(), minlength=count) / size
+    area = np.maximum(np.bincount(stone.ravel(), minlength=count), 1)
+    tone = np.bincount(stone.ravel(), fields.ranks(bands).ravel(), minlength=count) / area
     worn = rng.normal(0, (0.07, 0.07), (count, 2))
-    stones = _colour(FLOOR, tone + rng.normal(0, 0.012, count))
+    stones = fields.colours(FLOOR, tone + rng.normal(0, 0.012, count))
     stones = stones * (1 + worn[:, :1]) + worn[:, 1:] * (0.4, 0.1, -0.4)
-    height = np.clip(edge / 1.6, 0, 1) + gaussian_filter(rng.normal(0, 0.5, shape), 0.8, mode="wrap")
+    relief = np.clip(edge / 1.6, 0, 1) + gaussian_filter(rng.normal(0, 0.5, shape), 0.8, mode="wrap")
     joint = np.clip(edge - GROUT / 2, 0, 1)[..., None]
-    return _lit(_rgb(JOINT) * (1 - joint) + stones[stone] * joint, height)
+    return _lit(fields.rgb(JOINT) * (1 - joint) + stones[stone] * joint, relief)
 
 
 def _stones(shape: tuple[int, int], tangent: Array, rng: Generator) -> tuple[Array, Array]:
@@ -164,30 +166,30 @@ def _stones(shape: tuple[int, int], tangent: Array, rng: Generator) -> tuple[Arr
         first, second = np.take_along_axis(far, order, 1).T
         stone = np.take_along_axis(near, order[:, :1], 1)[:, 0]
         step = np.take_along_axis(step, order[:, :1, None], 1)[:, 0]
-        size = np.maximum(np.bincount(stone, minlength=len(centres)), 1)
-        shift = np.stack([np.bincount(stone, step[:, k], minlength=len(centres)) / size for k in (0, 1)], -1)
+        area = np.maximum(np.bincount(stone, minlength=len(centres)), 1)
+        shift = np.stack([np.bincount(stone, step[:, k], minlength=len(centres)) / area for k in (0, 1)], -1)
         centres = tree.data + shift
     return stone.reshape(shape), (second - first).reshape(shape) / 2
 
 
 def woodcut(shape: tuple[int, int], rng: Generator) -> Array:
     """Lines cut along the waves, over flat inks with dark outlines: a coloured woodblock print after Hokusai."""
-    waves = _noise(shape, rng, WAVE)
-    tangent = _along(waves, drift=DRIFT)
-    tone = _ranks(waves)
+    waves = fields.noise(shape, rng, WAVE)
+    tangent = fields.along(waves, drift=DRIFT)
+    tone = fields.ranks(waves)
     lines = _lines(shape, tangent, rng)
-    picture = _colour(INKS, tone)
+    picture = fields.colours(INKS, tone)
     # Swelling lines: a cutter shades each form from one side, and leaves the other clear.
-    starts, ink = np.array([*(start for start, _ in INKS), 1.0]), _index(INKS, tone)
+    starts, ink = np.array([*(start for start, _ in INKS), 1.0]), fields.ink_index(INKS, tone)
     across = (tone - starts[ink]) / (starts[ink + 1] - starts[ink])
-    shading = 1.0 - 1.1 * across + 0.25 * _noise(shape, rng, WAVE / 2)
-    cut = _step(lines - 0.75 + shading, 0.5)[..., None]
-    picture = picture + cut * (_colour(CUTS, tone) - picture)
-    slope = np.hypot(*_gradient(tone)) + 1e-4
-    distance = np.min([abs(tone - start) for start in starts[1:-1]], axis=0) / slope
-    swell = OUTLINE * (1 + 0.4 * _noise(shape, rng, 24))
+    shading = 1.0 - 1.1 * across + 0.25 * fields.noise(shape, rng, WAVE / 2)
+    cut = fields.smooth_step(lines - 0.75 + shading, 0.5)[..., None]
+    picture = picture + cut * (fields.colours(CUTS, tone) - picture)
+    slope = np.hypot(*fields.gradient(tone)) + 1e-4
+    distance = np.min([abs(tone - start) for start in starts[1:-1]], axis=0) / slope  # pixels, to first order
+    swell = OUTLINE * (1 + 0.4 * fields.noise(shape, rng, 24))
     outline = np.clip(swell / 2 - distance + 0.5, 0, 1)[..., None]
-    picture = picture + outline * (_rgb(KEY) - picture)
+    picture = picture + outline * (fields.rgb(KEY) - picture)
     grain = gaussian_filter(rng.standard_normal(shape), (0.7, 9), mode="wrap")
     return picture * (1 + 0.03 * grain / grain.std())[..., None] + 0.012 * rng.standard_normal((*shape, 1))
 
@@ -203,39 +205,30 @@ def _lines(shape: tuple[int, int], tangent: Array, rng: Generator) -> Array:
     for _ in range(COMBS):
         spectrum, combed = fft.rfft2(field) * band, np.zeros(shape)
         for angle in np.arange(TURNS) * np.pi / TURNS:
-            response = fft.irfft2(spectrum * np.exp(-(_turned(across - angle) ** 2) / (2 * 0.22**2)), s=shape)
-            combed += response * np.clip(1 - abs(_turned(along - angle)) * TURNS / np.pi, 0, 1)
+            turned = np.exp(-(fields.between_lines(across - angle) ** 2) / (2 * 0.22**2))
+            response = fft.irfft2(spectrum * turned, s=shape)
+            combed += response * np.clip(1 - abs(fields.between_lines(along - angle)) * TURNS / np.pi, 0, 1)
         field = np.tanh(2 * combed / combed.std())
     return field
 
 
-def _turned(angle: Array) -> Array:
-    """The angle between two lines, -pi/2 to pi/2."""
-    return (angle + np.pi / 2) % np.pi - np.pi / 2
-
-
-def _step(value: Array, width: float) -> Array:
-    """0 to 1 around 0, smoothly."""
-    t = np.clip(value / width + 0.5, 0, 1)
-    return t * t * (3 - 2 * t)
-
-
 def watercolour(shape: tuple[int, int], rng: Generator) -> Array:
     """Glazes with dark rims that dried one over the other on rough paper, ink lines and splashes: a wet garden."""
-    tooth = _noise(shape, rng, TOOTH, octaves=0.6)
-    picture = np.broadcast_to(_rgb(PAPER), (*shape, 3))
+    cloud = partial(fields.noise, shape, rng)
+    tooth = cloud(TOOTH, octaves=0.6)
+    picture = np.broadcast_to(fields.rgb(PAPER), (*shape, 3))
     for share, *pair in GLAZES:
-        pool = _noise(shape, rng, POOL) + 0.3 * _noise(shape, rng, POOL / 3) + 0.06 * _noise(shape, rng, POOL / 9)
+        pool = cloud(POOL) + 0.3 * cloud(POOL / 3) + 0.06 * cloud(POOL / 9)
         for pigment, side in zip(pair, (pool, -pool), strict=True):
-            inside = _distance(side, 1 - share)
-            wash = 0.55 + 0.25 * np.clip(_noise(shape, rng, POOL / 2), -1.5, 1.5) + 0.13 * tooth
+            inside = fields.distance(side, 1 - share)
+            wash = 0.55 + 0.25 * np.clip(cloud(POOL / 2), -1.5, 1.5) + 0.13 * tooth
             rim = RIM * np.exp(-np.maximum(inside, 0) / 2)
-            picture = picture * _rgb(pigment) ** (_step(inside, 2.0) * np.maximum(wash + rim, 0.1))[..., None]
-    pen = _noise(shape, rng, POOL, octaves=0.5) + 0.15 * _noise(shape, rng, POOL / 5)
-    pressure = 0.8 + 0.9 * _noise(shape, rng, POOL / 2)
-    ink = np.clip(pressure - abs(_distance(pen, 0.5)) + 0.5, 0, 1)
-    splashes = _splashes(shape, rng)
-    picture = picture * _rgb(INK) ** np.maximum(0.9 * ink, splashes)[..., None]
+            thickness = fields.smooth_step(inside, 2.0) * np.maximum(wash + rim, 0.1)
+            picture = picture * fields.rgb(pigment) ** thickness[..., None]  # Beer's law
+    pen = cloud(POOL, octaves=0.5) + 0.15 * cloud(POOL / 5)
+    pressure = 0.8 + 0.9 * cloud(POOL / 2)
+    ink = np.clip(pressure - abs(fields.distance(pen, 0.5)) + 0.5, 0, 1)
+    picture = picture * fields.rgb(INK) ** np.maximum(0.9 * ink, _splashes(shape, rng))[..., None]
     return picture * (1 + 0.035 * (tooth - np.roll(tooth, (1, 1), (0, 1))))[..., None]
 
 
@@ -253,66 +246,16 @@ def _splashes(shape: tuple[int, int], rng: Generator) -> Array:
     return cover
 
 
-def _distance(field: Array, level: float) -> Array:
-    """How far inside the contour above which the field's share 1 - level lies [pixels], to first order."""
-    ranks = _ranks(field)
-    return (ranks - level) / (np.hypot(*_gradient(ranks)) + 2e-3)
-
-
-def _lit(canvas: Array, height: Array) -> Array:
+def _lit(canvas: Array, relief: Array) -> Array:
     """Thick paint under a lamp at the upper left."""
-    slope = (height - np.roll(height, (1, 1), (0, 1))) / 2
+    slope = (relief - np.roll(relief, (1, 1), (0, 1))) / 2
     return canvas * (1 + RELIEF * np.clip(slope, -1, 1))[..., None]
 
 
-def _noise(shape: tuple[int, int], rng: Generator, wavelength: float, *, octaves: float = 0.3) -> Array:
-    """Isotropic periodic noise of unit variance around one wavelength: nothing slower, so that all crops look alike."""
-    frequency = np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :])
-    with np.errstate(divide="ignore"):
-        gain = np.exp(-(np.log2(frequency * wavelength) ** 2) / (2 * octaves**2))
-    field = fft.irfft2(fft.rfft2(rng.standard_normal(shape)) * gain, s=shape)
-    return field / field.std()
-
-
-def _gradient(field: Array) -> tuple[Array, Array]:
-    """d/dx and d/dy, around the border."""
-    return tuple((np.roll(field, -1, axis) - np.roll(field, 1, axis)) / 2 for axis in (1, 0))
-
-
-def _along(field: Array, *, drift: float = 0.0) -> Array:
-    """Unit vectors (x, y) along the level lines of a field, pulled towards +x by a share of its usual slope."""
-    gx, gy = _gradient(field)
-    gy = gy - drift * np.sqrt(np.mean(gx**2 + gy**2))
-    return np.stack([-gy, gx]) / (np.hypot(gx, gy) + 1e-9)
-
-
-def _curvature(tangent: Array) -> Array:
-    """Of the lines that follow a field of unit vectors, [1/pixel]."""
-    (xx, xy), (yx, yy) = _gradient(tangent[0]), _gradient(tangent[1])
-    turn = [tangent[0] * dy - tangent[1] * dx for dx, dy in ((xx, yx), (xy, yy))]
-    return turn[0] * tangent[0] + turn[1] * tangent[1]
-
-
-def _ranks(field: Array) -> Array:
-    """Even shares of 0 to 1, for a palette whose colours are all used, and used in every neighbourhood."""
-    field = field - gaussian_filter(field, NEIGHBOURHOOD, mode="wrap")
-    field = field / np.sqrt(gaussian_filter(field**2, NEIGHBOURHOOD, mode="wrap"))
-    order = np.empty(field.size)
-    order[np.argsort(field, axis=None, kind="stable")] = (np.arange(field.size) + 0.5) / field.size
-    return order.reshape(field.shape)
-
-
-def _rgb(code: str) -> Array:
-    return np.array([int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-
-
-def _index(palette: tuple[tuple[float, str], ...], tone: Array) -> Array:
-    return np.clip(np.searchsorted([start for start, _ in palette], tone, side="right") - 1, 0, None)
-
-
-def _colour(palette: tuple[tuple[float, str], ...], tone: Array) -> Array:
-    """The palette's colours at tones 0 to 1, each from its own tone upwards."""
-    return np.stack([_rgb(code) for _, code in palette])[_index(palette, tone)]
-
-
-STYLES: dict[str, Callable[[tuple[int, int], Generator], Array]] = {"strokes": strokes, "mosaic": mosaic, "woodcut": woodcut, "watercolour": watercolour}
+STYLES: dict[str, Callable[[tuple[int, int], Generator], Array]] = {
+    "strokes": strokes,
+    "mosaic": mosaic,
+    "woodcut": woodcut,
+    "watercolour": watercolour,
+}
+"""Each paints (H, W, 3) of a given shape."""

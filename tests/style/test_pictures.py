@@ -47,11 +47,10 @@ def test_the_same_seed_gives_the_same_bytes_whatever_numpy_drew_before(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_another_seed_gives_another_picture_of_the_same_manner(name, paintings):
-    first, other = paintings[name], painting(name, seed=1)
-    # Two draws share no stroke: luminances are unrelated. Over some 60 independent patches chance stays below 0.3.
-    assert abs(np.corrcoef(first.mean(0).flatten(), other.mean(0).flatten())[0, 1]) < 0.3
-    # Mean colours: the spread of a 256-pixel crop, halved for four times the area.
-    assert (first.mean((1, 2)) - other.mean((1, 2))).abs().max() < 0.015
+    first, other = paintings[name], painting(name, size=256, seed=1)
+    # Two draws share no stroke, so luminances are unrelated: by chance +-0.1 over some 60 independent patches.
+    assert abs(np.corrcoef(first[:, :256, :256].mean(0).flatten(), other.mean(0).flatten())[0, 1]) < 0.3
+    assert (first.mean((1, 2)) - other.mean((1, 2))).abs().max() < 0.03  # one more crop of 256 pixels, as below
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -63,7 +62,7 @@ def test_shape_type_and_range(name, size):
     assert picture.is_contiguous()
     assert picture.min() >= 0
     assert picture.max() <= 1
-    # The tensor is what an 8-bit file holds: 1e-6 is float32's rounding of k/255 times 255.
+    # The tensor is what an 8-bit file holds; float32 rounds k / 255 * 255 to 255 * 6e-8 = 1.5e-5.
     assert ((255 * picture) - (255 * picture).round()).abs().max() < 1e-4
 
 
@@ -71,24 +70,24 @@ def test_shape_type_and_range(name, size):
 def test_every_crop_of_256_pixels_has_the_colours_of_the_whole(name, paintings):
     picture = paintings[name]
     off = crop_means(picture) - picture.mean((1, 2))[:, None]
-    assert off.abs().max() < 0.03  # measured 0.017 to 0.029 (seed 0), where the pixels' own spread is 0.15 to 0.32
+    assert off.abs().max() < 0.03  # measured 0.015 to 0.029, where the pixels' own spread is 0.15 to 0.32
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_colours_are_rich_and_hardly_clipped(name, paintings):
     picture = paintings[name]
-    assert picture.std((1, 2)).min() > 0.14  # a photograph's usual spread; a gray or pale picture teaches little
+    assert picture.std((1, 2)).min() > 0.14  # measured 0.16 to 0.23: a dull picture teaches little
     chroma = (picture.amax(0) - picture.amin(0)).mean()
-    assert chroma > 0.15  # measured 0.2 to 0.35
-    assert ((picture == 0) | (picture == 1)).float().mean() < 0.06
+    assert chroma > 0.15  # measured 0.21 to 0.43; 0 is gray
+    assert ((picture == 0) | (picture == 1)).float().mean() < 0.06  # measured 0.001 to 0.046: navy has no red
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_strokes_keep_their_size_in_a_larger_picture(name, paintings):
-    small, large = spectrum(paintings[name]), spectrum(painting(name, size=(320, 768), seed=2))
-    # Half the total variation between the two spectra: 0 for the same texture, measured 0.02 or less ...
-    assert abs(small - large).sum() / 2 < 0.05
-    # ... and three times the bound at the least for the same painting shown at three quarters of its size.
+    small, large = spectrum(paintings[name]), spectrum(painting(name, size=(256, 640), seed=2))
+    # Total variation between the spectra: measured 0.009 to 0.016 for two pictures of a manner ...
+    assert abs(small - large).sum() / 2 < 0.04
+    # ... and 0.07 to 0.25 for the same painting at three quarters of its scale, which the measure must see.
     shrunk = functional.interpolate(paintings[name][None], scale_factor=0.75, mode="area")[0]
     assert abs(small - spectrum(shrunk)).sum() / 2 > 0.05
 
@@ -98,8 +97,8 @@ def test_pictures_wrap_around(name, paintings):
     picture = paintings[name].mean(0)
     for axis in (0, 1):
         steps = (picture - picture.roll(1, axis)).abs().mean(1 - axis)
-        # The step over the border is one of the 512 steps between neighbours, not an edge.
-        assert steps[0] < steps[1:].mean() + 5 * steps[1:].std()
+        # The step over the border is one of the 512 steps between neighbours, not an edge: measured -1.6 to 0.9 deviations.
+        assert steps[0] < steps[1:].mean() + 4 * steps[1:].std()
 
 
 def test_strokes_follow_their_swirls(paintings):
@@ -116,7 +115,7 @@ def test_strokes_follow_their_swirls(paintings):
         gray = paintings[name].mean(0).double().numpy()
         phase = np.angle(np.fft.fft2(np.random.Generator(np.random.Philox(key=0)).standard_normal(gray.shape)))
         noise = np.fft.ifft2(abs(np.fft.fft2(gray)) * np.exp(1j * phase)).real
-        assert coherence(gray) > 1.5 * coherence(noise), name
+        assert coherence(gray) > 1.25 * coherence(noise), (name, coherence(gray), coherence(noise))
 
 
 @pytest.mark.parametrize(
