@@ -97,7 +97,7 @@ def test_pictures_wrap_around(name, paintings):
     picture = paintings[name].mean(0)
     for axis in (0, 1):
         steps = (picture - picture.roll(1, axis)).abs().mean(1 - axis)
-        # The step over the border is one of the 512 steps between neighbours, not an edge: measured -1.6 to 0.9 deviations.
+        # The step over the border is one of the 512 steps between neighbours, no edge: measured -1.6 to 0.9 deviations.
         assert steps[0] < steps[1:].mean() + 4 * steps[1:].std()
 
 
@@ -115,7 +115,7 @@ def test_strokes_follow_their_swirls(paintings):
         gray = paintings[name].mean(0).double().numpy()
         phase = np.angle(np.fft.fft2(np.random.Generator(np.random.Philox(key=0)).standard_normal(gray.shape)))
         noise = np.fft.ifft2(abs(np.fft.fft2(gray)) * np.exp(1j * phase)).real
-        assert coherence(gray) > 1.25 * coherence(noise), (name, coherence(gray), coherence(noise))
+        assert coherence(gray) > 2 * coherence(noise), name  # measured 0.52 and 0.60 over 0.13 and 0.16
 
 
 @pytest.mark.parametrize(
