@@ -1,0 +1,98 @@
+"""Painting: the picture itself is what is optimised, equation (3.13), from white noise or from a photograph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from kcam.ste import clip_ste
+from kcam.style.draws import torch_generator
+from kcam.style.losses import StyleLoss
+
+STARTS = ("photo", "noise")
+NOISE = 0.15  # RMS of the white noise that a picture may start from, around gray
+GRAY = 0.45
+
+
+def paint(
+    loss: StyleLoss,
+    *,
+    photo: Tensor | None = None,
+    shape: tuple[int, int] | None = None,
+    start: str | None = None,
+    steps: int = 200,
+    rate: float = 0.03,
+    seed: int = 0,
+    advance: Callable[[int, dict[str, float]], None] | None = None,
+) -> Tensor:
+    """Optimise a picture: y = argmin of the loss (eq. 3.13), Gatys et al.'s style transfer or texture synthesis.
+
+    Adam works on the picture's spectrum, each frequency on a scale that falls as 1 / f like a picture's own: a step
+    moves wide areas as readily as fine detail, where on the pixels it would move the detail alone.
+
+    Args:      loss: with its weights; without a photo its content and l2 must be 0.
+               photo: what the picture should show, (3,H,W) sRGB in [0,1]; None for a texture of the style alone.
+               shape: (H,W) of a texture; the features' own steps are met by painting a little more than is kept.
+               start: "photo" or "noise"; None for the photo if there is one.
+               rate: of Adam, at its start; it falls to 0 by half a cosine.
+               seed: of the noise.
+               advance: called with each step's number and the terms of its loss.
+    Returns:   (3,H,W) in [0,1].
+    Raises:    ValueError for a start that is not there, neither photo nor shape, or a loss that is not finite;
+               what the features raise for a picture that is too small.
+    Source:    Gatys, Ecker and Bethge, Image style transfer using convolutional neural networks (2016); the
+               preconditioning after Olah, Mordvintsev and Schubert, Feature visualization (2017).
+    """
+    start = start or ("noise" if photo is None else "photo")
+    if start not in STARTS or (start == "photo" and photo is None):
+        raise ValueError(f'start must be "photo", with a photo, or "noise"; got {start!r}.')
+    if photo is None and shape is None:
+        raise ValueError("a texture needs a size: pass shape=(256, 256), or a photo to paint.")
+    if photo is None and (loss.weights["content"] or loss.weights["l2"]):
+        raise ValueError("there is no photo for the content to be compared with. Pass StyleLoss(..., content=0).")
+    if photo is not None and (photo.ndim != 3 or photo.shape[0] != 3):
+        raise ValueError(f"a photo is one picture (3,H,W), got shape {tuple(photo.shape)}.")
+    height, width = photo.shape[-2:] if photo is not None else shape or (0, 0)
+    multiple, least = loss.features.multiple, loss.features.least
+    rows, columns = (max(least, math.ceil(size / multiple) * multiple) for size in (height, width))
+    device = loss.quantiles.device
+    scene = None
+    if photo is not None:
+        scene = F.pad(photo[None].float().to(device), (0, columns - width, 0, rows - height), mode="replicate")
+    if start == "photo" and scene is not None:
+        begun = scene
+    else:
+        noise = torch.randn(1, 3, rows, columns, generator=torch_generator(seed, 0))
+        begun = (GRAY + NOISE * noise).clamp(0, 1).to(device)
+    scale = spectral_scale(rows, columns).to(begun)
+    spectrum = torch.view_as_real(torch.fft.rfft2(begun - GRAY, norm="ortho") / scale).clone().requires_grad_()
+    optimiser = torch.optim.Adam([spectrum], lr=rate)
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+        optimiser.zero_grad()
+        terms = loss.terms(_picture(spectrum, scale, (rows, columns)), scene, turn=step)
+        total = torch.stack(list(terms.values())).sum()
+        if not total.isfinite():
+            raise ValueError(f"the loss is {total.item():g} at step {step}. Use a lower rate than {rate:g}.")
+        total.backward()
+        optimiser.step()
+        if advance is not None:
+            advance(step + 1, {name: float(value.detach()) for name, value in terms.items()})
+    with torch.no_grad():
+        return _picture(spectrum, scale, (rows, columns))[0, :, :height, :width].clone()
+
+
+def spectral_scale(height: int, width: int) -> Tensor:
+    """The 1 / f that a picture's spectrum falls by, (H, W/2+1), 1 / max(f, 1 / longer side), of mean square 1."""
+    rows, columns = torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)
+    scale = 1 / torch.hypot(rows, columns).clamp(min=1 / max(height, width))
+    return scale / scale.square().mean().sqrt()
+
+
+def _picture(spectrum: Tensor, scale: Tensor, shape: tuple[int, int]) -> Tensor:
+    values = torch.fft.irfft2(torch.view_as_complex(spectrum) * scale, s=shape, norm="ortho")
+    return clip_ste(values + GRAY, 0.0, 1.0)
