@@ -26,7 +26,8 @@ from skimage.exposure import match_histograms
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
-PATCH, FACTORS, PROJECTIONS = 7, (1, 2, 4), 128
+PATCH, PROJECTIONS = 7, 128
+STRIDES = {1: 3, 2: 1, 4: 1}  # of the patches, by level: odd, so that no colour lattice is met in one phase only
 WAVELENGTHS, DIRECTIONS = (4, 8, 16), 8
 ONE_OCTAVE = 0.56  # the envelope's sigma, in wavelengths, of a Gabor filter one octave wide
 HIGH_PASS = 2.0  # sigma of what `wallpaper` takes away: it leaves the edges of strokes, not where scenes are bright
@@ -36,7 +37,10 @@ SMALLEST = 64  # pixels: the widest filter's reach, 3 sigma of 16 pixels, must f
 
 
 def patch_swd(picture: Tensor, other: Tensor) -> float:
-    """Sliced Wasserstein distance between all 7 x 7 patches of two pictures, the mean over levels 1, 1/2 and 1/4."""
+    """Sliced Wasserstein distance between the 7 x 7 patches of two pictures, the mean over levels 1, 1/2 and 1/4.
+
+    Patches are from the whole picture, overlapping: each at 1/2 and 1/4, every third along rows and columns at 1.
+    """
     return _apart(_patches(picture), _patches(other))
 
 
@@ -62,7 +66,7 @@ def detail_correlation(picture: Tensor, scene: Tensor) -> float:
 
 
 def wallpaper(pictures: Iterable[Tensor]) -> float:
-    """The largest absolute correlation of high-pass luma (less a Gaussian of sigma 2) between shots of different scenes.
+    """The largest absolute correlation between shots of different scenes of their luma less a Gaussian of sigma 2.
 
     All are cropped to the common size from the top left, where a pattern that does not know the scene begins.
     """
@@ -76,12 +80,12 @@ def wallpaper(pictures: Iterable[Tensor]) -> float:
 
 def gap_closed(value: float, *, ordinary: float, other: float) -> float:
     """1 where the shot is as near to the style as another picture in it, 0 where it is as far as an ordinary one."""
+    if other >= ordinary:
+        raise ValueError(f"no gap to close: an ordinary picture ({ordinary:.3g}) is as near as the style ({other:.3g})")
     return (ordinary - value) / (ordinary - other)
 
 
-def measure(
-    shot: Tensor, *, scene: Tensor, ordinary: Tensor, style: Tensor, other_style: Tensor
-) -> dict[str, float]:
+def measure(shot: Tensor, *, scene: Tensor, ordinary: Tensor, style: Tensor, other_style: Tensor) -> dict[str, float]:
     """All that one shot tells.
 
     Args:      shot: the picture to judge. scene: what was photographed. ordinary: an ordinary camera's picture of it.
@@ -130,11 +134,14 @@ def blend(photo: Tensor, style: Tensor) -> Tensor:
 
 
 def _patches(picture: Tensor) -> list[np.ndarray]:
-    _check(picture)
+    picture = _checked(picture).float()
     directions = _directions(3 * PATCH**2).reshape(PROJECTIONS, 3, PATCH, PATCH)
-    sides = [tuple(side // factor for side in picture.shape[-2:]) for factor in FACTORS]
-    levels = [interpolate(picture[None].float(), side, mode="bilinear", antialias=True) for side in sides]
-    return [_quantiles(conv2d(level, directions)[0].flatten(1)) for level in levels]
+    answers = []
+    for factor, stride in STRIDES.items():
+        side = [length // factor for length in picture.shape[-2:]]
+        level = interpolate(picture[None], side, mode="bilinear", antialias=True)
+        answers.append(_quantiles(conv2d(level, directions, stride=stride)[0].flatten(1)))
+    return answers
 
 
 def _energies(picture: Tensor) -> list[np.ndarray]:
@@ -145,35 +152,41 @@ def _energies(picture: Tensor) -> list[np.ndarray]:
     for wavelength in WAVELENGTHS:
         # the filter's own answer to a constant is 0.002 of it, more than some texture
         waves = _gabor(ranks - _blur(ranks, ONE_OCTAVE * wavelength), wavelength)
-        energy = _blur(waves.square().sum(1), wavelength)
-        amplitudes.append(energy.clamp(min=0).sqrt().sort(0).values)
-    # neighbours say the same: the finest energy is smoothed over 4 pixels
-    vectors = torch.cat(amplitudes)[:, ::2, ::2].flatten(1)
+        # neighbours say the same where the least sigma is 4 pixels: every second one will do
+        energy = _blur(waves.square().sum(1), wavelength, stride=2)
+        amplitudes.append(energy.sqrt().sort(0).values)
+    vectors = torch.cat(amplitudes).flatten(1)
     return [_quantiles(_directions(len(vectors)) @ vectors)]
 
 
 def _gabor(plane: Tensor, wavelength: float) -> Tensor:
-    """Answers (directions, 2, H, W) of cosine and sine waves under a round Gaussian, which is what makes it separable."""
+    """Answers (directions, 2, H, W) to cosine and sine waves under a Gaussian, round, so that rows and columns part."""
     t = _offsets(ONE_OCTAVE * wavelength)
     envelope = _gaussian(ONE_OCTAVE * wavelength)
     angles = torch.arange(DIRECTIONS) * pi / DIRECTIONS
     phase_x, phase_y = (2 * pi / wavelength * f(angles)[:, None] * t for f in (torch.cos, torch.sin))
     along_x = torch.stack([phase_x.cos(), phase_x.sin()], 1).flatten(0, 1) * envelope
-    # (cx + i sx)(cy + i sy)
-    rows = torch.stack([torch.stack([phase_y.cos(), -phase_y.sin()], 1), torch.stack([phase_y.sin(), phase_y.cos()], 1)], 1)
-    along_y = (rows * envelope).flatten(0, 1)
+    # (cos x + i sin x) (cos y + i sin y), its real part and then its imaginary
+    real = torch.stack([phase_y.cos(), -phase_y.sin()], 1)
+    imaginary = torch.stack([phase_y.sin(), phase_y.cos()], 1)
+    along_y = torch.stack([real, imaginary], 1).flatten(0, 1) * envelope
     reach = len(t) // 2
     wide = pad(plane[None, None], (reach,) * 4, mode="reflect")
     answers = conv2d(conv2d(wide, along_x[:, None, None, :]), along_y[..., None], groups=DIRECTIONS)
     return answers[0].unflatten(0, (DIRECTIONS, 2))
 
 
-def _blur(planes: Tensor, sigma: float) -> Tensor:
-    kernel = _gaussian(sigma).to(planes.dtype)
-    reach = len(kernel) // 2
-    flat = planes.reshape(-1, 1, *planes.shape[-2:])
-    flat = conv2d(pad(flat, (reach,) * 4, mode="reflect"), kernel[None, None, None, :])
-    return conv2d(flat, kernel[None, None, :, None]).reshape(planes.shape)
+def _blur(planes: Tensor, sigma: float, *, stride: int = 1) -> Tensor:
+    height, width = planes.shape[-2:]
+    return _smoothing(height, sigma)[::stride].to(planes) @ planes @ _smoothing(width, sigma)[::stride].T.to(planes)
+
+
+@lru_cache(maxsize=64)
+def _smoothing(side: int, sigma: float) -> Tensor:
+    """A Gaussian with reflecting borders as a matrix (side, side): a product is far quicker than the convolution."""
+    kernel = _gaussian(sigma).double()
+    mirrored = pad(torch.eye(side, dtype=torch.float64)[None], (len(kernel) // 2,) * 2, mode="reflect")
+    return (mirrored[0].unfold(1, len(kernel), 1) @ kernel).T
 
 
 def _offsets(sigma: float) -> Tensor:
@@ -206,8 +219,9 @@ def _apart(levels: list[np.ndarray], others: list[np.ndarray]) -> float:
 
 
 def _luma(picture: Tensor) -> Tensor:
-    _check(picture)
-    return torch.tensordot(torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64), picture.double(), 1)
+    # element by element: a dot product may round its last elements differently, and equal pixels would rank apart
+    red, green, blue = _checked(picture).double()
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def _correlation(a: Tensor, b: Tensor) -> float:
@@ -221,9 +235,11 @@ def _resized(picture: Tensor, size: int) -> Tensor:
     return linear_rgb_to_rgb(interpolate(light, (size, size), mode="bilinear", antialias=True))[0].clamp(0, 1)
 
 
-def _check(picture: Tensor) -> None:
-    if picture.ndim != 3 or picture.shape[0] != 3 or min(picture.shape[-2:]) < SMALLEST:
-        raise ValueError(f"expected a picture (3, H, W) of at least {SMALLEST} pixels a side, got {tuple(picture.shape)}")
+def _checked(picture: Tensor) -> Tensor:
+    shape = tuple(picture.shape)
+    if len(shape) != 3 or shape[0] != 3 or min(shape[1:]) < SMALLEST:
+        raise ValueError(f"expected a picture (3, H, W) of at least {SMALLEST} pixels a side, got {shape}")
+    return picture.detach().cpu()
 
 
 def _check_same_size(picture: Tensor, scene: Tensor) -> None:
