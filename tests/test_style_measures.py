@@ -184,6 +184,18 @@ def test_a_negative_is_told_by_its_sign(photographs):
     assert measures.detail_correlation(1 - hopper, hopper) == pytest.approx(-1)
 
 
+def test_luminance_is_rec_709():
+    noisy, dark = noise(3, 64, 64), torch.zeros(3, 64, 64)
+    shares = []
+    for channel in range(3):
+        only = dark.clone()
+        only[channel] = noisy[channel]
+        shares.append(measures.luminance_correlation(only, noisy))
+    # of three independent channels each explains its weight over the norm of the weights
+    weights = np.array([0.2126, 0.7152, 0.0722])
+    assert shares == pytest.approx(list(weights / np.linalg.norm(weights)), abs=0.05)  # 3 sigma of 4096 pixels
+
+
 def test_detail_is_lost_where_luminance_is_not(photographs, gravel):
     # strokes over a scene of which only large patches of light are left: .65 and .48, next to 1 and 1
     strokes = gravel[:, :SIDE, :SIDE] - blurred(gravel[:, :SIDE, :SIDE], 8)
