@@ -1,0 +1,1 @@
+"""Cameras that learn the style of a picture."""
