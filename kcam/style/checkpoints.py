@@ -2,9 +2,9 @@
 
     folder/step-000500/tensors.safetensors  state.json  MANIFEST.json     the last few, and the best
 
-A checkpoint is written beside its place, put on the disk, and renamed: `step-N` is there when all of it is. The manifest
-holds the size and the sha256 of the other two; what does not match is set aside as `.corrupt-step-N-...`, and the one
-before is used. Nothing is pickled. `.tmp-...` and `.old-...` are what a dead process left, cleared up by the next one.
+A checkpoint is written beside its place, put on the disk, and renamed: `step-N` is there when all of it is. Its
+manifest holds the size and the sha256 of the others; what does not match is set aside as `.corrupt-step-N-...`, and the
+one before is used. Nothing is pickled. `.tmp-...` and `.old-...` are what a dead process left; the next clears it up.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def _read(path: Path, step: int) -> Checkpoint:
 def _tensors(tensors: Mapping[str, Tensor]) -> bytes:
     for name, tensor in tensors.items():
         if not isinstance(name, str) or name == "__metadata__":
-            raise ValueError(f"cannot save the tensor {name!r}: its name must be a str other than __metadata__. Rename it.")
+            raise ValueError(f"cannot save the tensor {name!r}: its name must be a str, not __metadata__. Rename it.")
         if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.dtype not in DTYPES:
             what = f"{tensor.layout} of {tensor.dtype}" if isinstance(tensor, Tensor) else f"a {type(tensor).__name__}"
             raise TypeError(f"cannot save {name!r}: it is {what}, and must be a dense tensor of real numbers or bool.")

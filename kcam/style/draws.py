@@ -32,21 +32,21 @@ def philox(seed: int, step: int, *, stream: int = 0) -> np.random.Generator:
 
 
 def torch_generator(seed: int, step: int, *, stream: int = 0, device: torch.device | str = "cpu") -> torch.Generator:
-    """A torch generator of its own for each (seed, step, stream).
+    """A torch generator of its own for each (seed, step, stream), for steps less than 2**32.
 
     torch's CPU generator reads only the low 32 bits of a seed. Drawn at random, two of 10 000 steps would share them
     in 1 run of 86; so they count the steps, from a start that is drawn: steps of one seed and stream never share them.
     """
     low, high = (int(word) for word in philox(seed, 0, stream=stream).bit_generator.random_raw(2))
-    own = (low + _whole("step", step)) % 2**32
+    own = (low + _whole("step", step, bits=32)) % 2**32
     return torch.Generator(device).manual_seed((high % 2**31) << 32 | own)
 
 
-def _whole(name: str, value: int) -> int:
+def _whole(name: str, value: int, *, bits: int = 63) -> int:
     try:
         number = -1 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = -1
-    if not 0 <= number < 2**63:
-        raise ValueError(f"{name} must be a whole number from 0 to 2**63 - 1, got {value!r}. Use {name}=0, say.")
+    if not 0 <= number < 2**bits:
+        raise ValueError(f"{name} must be a whole number from 0 to 2**{bits} - 1, got {value!r}. Use {name}=0, say.")
     return number
