@@ -374,7 +374,7 @@ def test_leftovers_are_cleared_up(tmp_path: Path):
 SITUATIONS = {
     "the first": ([], 1, 3),
     "one more": ([1, 2], 3, 3),
-    "one more, two go": ([1, 2, 3], 4, 1),  # keep=1, yet 1 to 3 are there: saved with more
+    "one more, three go": ([1, 2, 3], 4, 1),  # keep=1, yet 1 to 3 are there: saved with more
     "the same step": ([1, 2], 2, 3),
     "the same step, the only one": ([2], 2, 1),
 }
