@@ -1,1 +1,29 @@
-"""Cameras that learn a painting's style."""
+"""Cameras that learn a painting's style: features, losses, training, and painting itself."""
+
+from kcam.style.features import SteerableFeatures
+from kcam.style.losses import StyleLoss
+from kcam.style.painting import paint
+from kcam.style.pictures import STYLES, painting
+from kcam.style.presets import PRESETS, Preset, style_camera
+from kcam.style.scenes import BuiltinScenes, PatchScenes, Source
+from kcam.style.training import Progress, Settings, StyleWarning, Trained, TrainingError, fit
+
+__all__ = [
+    "PRESETS",
+    "STYLES",
+    "BuiltinScenes",
+    "PatchScenes",
+    "Preset",
+    "Progress",
+    "Settings",
+    "Source",
+    "SteerableFeatures",
+    "StyleLoss",
+    "StyleWarning",
+    "Trained",
+    "TrainingError",
+    "fit",
+    "paint",
+    "painting",
+    "style_camera",
+]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import random
 import signal
 import subprocess
@@ -12,39 +11,10 @@ from pathlib import Path
 
 import pytest
 import stores
+from deaths import Death, Killed
 from stores import SETTINGS, content, make_cubes, make_store
 
 from kcam.data import extract, make_plan, verify
-
-
-class Killed(BaseException):
-    """Nothing in the library may catch it."""
-
-
-BOUNDARIES = ("replace", "fsync", "mkdir", "unlink", "rmdir")
-
-
-class Death:
-    """Dies at the n-th call that changes the disk, before or after it; from then on nothing changes the disk."""
-
-    def __init__(self, patch: pytest.MonkeyPatch, number: int, *, after: bool) -> None:
-        self.left, self.after, self.dead = number, after, False
-        for name in BOUNDARIES:
-            patch.setattr(os, name, self.guard(getattr(os, name)))
-
-    def guard(self, call):
-        def guarded(*arguments, **named):
-            if self.dead:
-                raise Killed
-            self.left -= 1
-            if self.left >= 0:
-                return call(*arguments, **named)
-            self.dead = True
-            if self.after:
-                call(*arguments, **named)
-            raise Killed
-
-        return guarded
 
 
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
