@@ -171,8 +171,8 @@ class StyleStage(Stage):
         x = self.mix(torch.cat([x, noise[1]], dim=1))
         for block in self.blocks:
             x = block(x, *how)
-        x = F.relu(self.up1_norm(self.up1(F.interpolate(x, scale_factor=2, mode="nearest")), *how))
-        x = F.relu(self.up2_norm(self.up2(F.interpolate(x, scale_factor=2, mode="nearest")), *how))
+        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
+        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
         return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
@@ -193,6 +193,10 @@ class StyleStage(Stage):
                     height, width = inner[2] - inner[0], inner[3] - inner[1]
                     result[index, :, top : inner[2], left : inner[3]] = painted[0, :, y : y + height, x : x + width]
         return result
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
 def _cut(planes: tuple[Tensor, ...], top: int, left: int, bottom: int, right: int) -> tuple[Tensor, Tensor]:
