@@ -83,8 +83,8 @@ class StyleStage(Stage):
 
     Args:      width: channels at full size; twice and four times as many at half and a quarter.
                dilations: of the residual blocks.
-               noise: planes of white noise at full size, of noise drawn out along as many directions, and of white noise
-               at a quarter of the size.
+               noise: planes of white noise at full size, of noise drawn out along as many directions, and of white
+               noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
     Raises:    ValueError for a width, a dilation or a number of planes that is not positive, a negative level, and at
                the call for another number of channels than 3.
@@ -213,7 +213,7 @@ class StyleStage(Stage):
 
 
 def stroke_kernels(count: int) -> Tensor:
-    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25): of white noise they make unit noise."""
+    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25), of squares that sum to 1."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
     angle = torch.arange(count, dtype=torch.float64)[:, None, None] * (math.pi / count)
