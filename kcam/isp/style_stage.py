@@ -70,7 +70,8 @@ class StyleStage(Stage):
 
     y = sigmoid( M logit(x) + network(x, noise) )
 
-    Down to a quarter of the size in two strided convolutions, dilated residual blocks, back up by nearest neighbours.
+    Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where what was
+    there on the way down is added: the detail of the picture and of the noise.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
     the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
     Gaussians 6 pixels long and 1 wide, along directions that divide the half circle: from white noise alone a small
@@ -182,14 +183,14 @@ class StyleStage(Stage):
         """The network on a picture whose sides are multiples of 4, with its own statistics or the given ones."""
         how = (None if given is None else iter(given), seen)
         coded = torch.logit(picture.clamp(DARKEST, 1 - DARKEST))
-        x = F.relu(self.enter_norm(self.enter(torch.cat([2 * picture - 1, noise[0]], dim=1)), *how))
-        x = F.relu(self.down1_norm(self.down1(x), *how))
-        x = F.relu(self.down2_norm(self.down2(x), *how))
+        fine = F.relu(self.enter_norm(self.enter(torch.cat([2 * picture - 1, noise[0]], dim=1)), *how))
+        middle = F.relu(self.down1_norm(self.down1(fine), *how))
+        x = F.relu(self.down2_norm(self.down2(middle), *how))
         x = self.mix(torch.cat([x, noise[1]], dim=1))
         for block in self.blocks:
             x = block(x, *how)
-        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
-        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
+        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how)) + middle
+        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how)) + fine
         return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
