@@ -26,6 +26,7 @@ LAYERS = [
     {"kcam.augmentation", "kcam.data", "kcam.style"},
     {"kcam.tradeoff"},
     {"kcam.plots"},
+    {"kcam.report"},
     {"kcam.demo"},
     {"kcam.cli"},
     {"kcam.__main__"},
