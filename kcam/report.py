@@ -261,7 +261,7 @@ def loss_figure(history: Tensor, names: Sequence[str]) -> Figure:
     low, high = np.nanmin(values[:, shown]), np.nanmax(values[:, shown])
     widen = max(1.15, math.sqrt(3 * low / high))  # at least a factor of 3, so that there is a tick
     axes.set(yscale="log", ylim=(low / widen, high * widen))
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, steps=[1, 2, 5, 10]))
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, min_n_ticks=1, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 300 * low else (1.0, 2.0, 3.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())

@@ -193,6 +193,7 @@ def test_a_loss_curve_names_every_term_beside_its_end(steps: int) -> None:
         for _, name in sorted((float(line.get_ydata()[-1]), name) for line, name in zip(bold(axes), NAMES, strict=True))
     ]
     assert axes.get_yscale() == "log"
+    assert all(tick == round(tick) for tick in axes.get_xticks())  # a step is whole
     assert axes.get_legend() is None
     written, _ = boxes(figure)
     assert not [pair for pair in combinations(written, 2) if pair[0].overlaps(pair[1])]
