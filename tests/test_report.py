@@ -44,7 +44,9 @@ def boxes(figure: Figure) -> tuple[list[Any], list[Any]]:
     renderer = canvas.get_renderer()
     written = [text for text in figure.texts if text.get_text()]
     for axes in figure.axes:
-        written += [t for t in (*axes.texts, axes.xaxis.label, *axes.get_xticklabels()) if t.get_text()]
+        low, high = axes.get_xlim()
+        ticks = [t for t, x in zip(axes.get_xticklabels(), axes.get_xticks(), strict=True) if low <= x <= high]
+        written += [t for t in (*axes.texts, axes.xaxis.label, *ticks) if t.get_text()]
     return [text.get_window_extent(renderer) for text in written], [axes.bbox for axes in figure.axes]
 
 
