@@ -109,6 +109,12 @@ class StyleStage(Stage):
             raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.noise, self.level = width, tuple(dilations), tuple(noise), level
         half, quarter = 2 * width, 4 * width
+        with torch.random.fork_rng(devices=[]):  # torch's layers draw their own start first
+            self._build(width, half, quarter)
+        self._start()
+
+    def _build(self, width: int, half: int, quarter: int) -> None:
+        noise = self.noise
         self.enter, self.enter_norm = _Conv(3 + noise[0] + noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
         self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
@@ -118,7 +124,6 @@ class StyleStage(Stage):
         self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
         self.leave = _Conv(width, 3, 5)
         self.colour = nn.Parameter(torch.eye(3))
-        self._start()
 
     def _start(self) -> None:
         """The same start every time, whatever torch's own generator has given to others."""
