@@ -5,8 +5,8 @@
 
 Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting; it is measured on three
 other photographs of 256 pixels, against the ordinary camera's picture and a crop of the painting's right half
-(`style_measures`, which no arm is trained on, and the training loss). Runs are kept in the work folder one by one, so that
-two processes can share them.
+(`style_measures`, which no arm is trained on, and the training loss). Runs are kept in the work folder one by one, so
+that two processes can share them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -86,7 +87,10 @@ RATES = QUICK.settings.rates
 CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS)
 THESIS_LOSS = {"statistic": "gram", "style": 30.0, "colour": 0.0, "content": 0.0, "l2": 1.0}
 THESIS = replace(
-    PRESETS["thesis"].settings, steps=2 * CAMERA_STEPS, size=128, rates={"optics": 1e-3, "filter": 1e-3, "demosaic": 1e-3}
+    PRESETS["thesis"].settings,
+    steps=2 * CAMERA_STEPS,
+    size=128,
+    rates={"optics": 1e-3, "filter": 1e-3, "demosaic": 1e-3},
 )
 
 
@@ -174,8 +178,6 @@ def run(style: str, name: str, work: Path) -> dict[str, Any]:
     camera = arm.camera()
     loss = StyleLoss(own, crop=arm.settings.size, **arm.loss)
     began = time.perf_counter()
-    import warnings
-
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         trained = fit(camera, loss, settings=arm.settings)
@@ -213,7 +215,8 @@ def main() -> None:
         for name in arguments.arms.split(";"):
             if style in ARMS[name].styles:
                 row = run(style, name, arguments.work)
-                print(style, name, f"{row['seconds']:.0f} s", {k: round(v, 2) for k, v in row["mean"].items()}, flush=True)
+                mean = {key: round(value, 2) for key, value in row["mean"].items()}
+                print(style, name, f"{row['seconds']:.0f} s", mean, flush=True)
 
 
 def collect(work: Path) -> None:

@@ -444,8 +444,8 @@ def paint(
 
         plots.check_writable(out)
         picture = train.style_picture(style, size=style_size or None)
-        weights = {"content": content if photo else 0.0}
-        loss = StyleLoss(picture, features=train.style_features(features, vgg_weights or None), **weights)
+        layers = train.style_features(features, vgg_weights or None)
+        loss = StyleLoss(picture, features=layers, content=content if photo else 0.0, colour=1.0)
         shown = None
         if photo:
             shown = read_picture(photo).expand(3, -1, -1)

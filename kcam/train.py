@@ -100,9 +100,9 @@ def run(
     if options.preset not in style.PRESETS:
         raise ValueError(f'unknown preset "{options.preset}"; there are: {", ".join(style.PRESETS)}.')
     picture = style_picture(options.style, size=options.style_size)
-    document = {"options": asdict(options), "style": _hash(picture), "threads": _threads(folder, resume, threads)}
-    torch.set_num_threads(document["threads"])
-    with _processes(options.device) as (leads, device):
+    document: dict[str, Any] = {"options": asdict(options), "style": _hash(picture)}
+    document["threads"] = _threads(folder, resume, threads)
+    with _threads_set(document["threads"]), _processes(options.device) as (leads, device):
         _check_folder(folder, document, resume=resume)
         preset = style.PRESETS[options.preset]
         camera = _camera(options, preset).to(device)
@@ -130,6 +130,9 @@ def run(
                 plots.save_figure(figure, folder / f"{name}.png")
             return figures
 
+        def on_checkpoint(camera: Camera, step: int, history: Tensor) -> None:
+            show(camera, step, history, trained_names(loss))
+
         with warnings.catch_warnings(), _stopping() as stopped:
             warnings.showwarning = lambda message, *_: say(str(message))  # type: ignore[assignment]
             trained = style.fit(
@@ -140,7 +143,7 @@ def run(
                 folder=folder / "checkpoints",
                 resume=resume,
                 advance=None if advance is None else lambda progress: advance(progress, settings.steps),
-                on_checkpoint=lambda camera, step, history: show(camera, step, history, trained_names(loss)),
+                on_checkpoint=on_checkpoint,
                 stop=stopped,
             )
         if leads and trained.finished:
@@ -220,6 +223,16 @@ def _threads(folder: Path, resume: bool, threads: int | None) -> int:
     busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     free = max(1, min(cores, round(cores - busy)))
     return max(1, free // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+@contextmanager
+def _threads_set(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextmanager

@@ -70,8 +70,8 @@ class StyleStage(Stage):
 
     y = sigmoid( M logit(x) + network(x, noise) )
 
-    Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where what was
-    there on the way down is added: the detail of the picture and of the noise.
+    Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where the last
+    convolution also sees what the first one made: the detail of the picture and of the noise.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
     the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
     Gaussians 6 pixels long and 1 wide, along directions that divide the half circle: from white noise alone a small
@@ -107,7 +107,8 @@ class StyleStage(Stage):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
         if not level >= 0:
             raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
-        self.width, self.dilations, self.noise, self.level = width, tuple(dilations), tuple(noise), level
+        self.width, self.dilations, self.level = width, tuple(dilations), level
+        self.noise: Any = tuple(noise)
         half, quarter = 2 * width, 4 * width
         with torch.random.fork_rng(devices=[]):  # torch's layers draw their own start first
             self._build(width, half, quarter)
@@ -122,7 +123,7 @@ class StyleStage(Stage):
         self.blocks = nn.ModuleList(_Residual(quarter, dilation) for dilation in self.dilations)
         self.up1, self.up1_norm = _Conv(quarter, half, 3), _Norm(half)
         self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
-        self.leave = _Conv(width, 3, 5)
+        self.leave = _Conv(2 * width, 3, 5)
         self.colour = nn.Parameter(torch.eye(3))
 
     def _start(self) -> None:
@@ -131,7 +132,7 @@ class StyleStage(Stage):
         for layer in self.modules():
             if isinstance(layer, _Conv):
                 nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=seeded)
-                nn.init.zeros_(layer.bias)
+                nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
         nn.init.zeros_(self.leave.weight)
 
     @property
@@ -189,14 +190,15 @@ class StyleStage(Stage):
         how = (None if given is None else iter(given), seen)
         coded = torch.logit(picture.clamp(DARKEST, 1 - DARKEST))
         fine = F.relu(self.enter_norm(self.enter(torch.cat([2 * picture - 1, noise[0]], dim=1)), *how))
-        middle = F.relu(self.down1_norm(self.down1(fine), *how))
-        x = F.relu(self.down2_norm(self.down2(middle), *how))
+        x = F.relu(self.down1_norm(self.down1(fine), *how))
+        x = F.relu(self.down2_norm(self.down2(x), *how))
         x = self.mix(torch.cat([x, noise[1]], dim=1))
         for block in self.blocks:
             x = block(x, *how)
-        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how)) + middle
-        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how)) + fine
-        return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
+        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
+        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
+        change = self.leave(torch.cat([x, fine], dim=1))
+        return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + change)
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
         """A large picture, tile by tile with a border as wide as the reach: bounded memory, no seams."""

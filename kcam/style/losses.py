@@ -171,6 +171,9 @@ class StyleLoss(nn.Module):
                picture.
     """
 
+    quantiles: Tensor
+    deviation: Tensor
+
     def __init__(
         self,
         picture: Tensor,
@@ -195,10 +198,11 @@ class StyleLoss(nn.Module):
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
                 raise ValueError(f"the weight of {name} must be a finite number >= 0, got {weight!r}.")
-        self.features: Any = SteerableFeatures() if features is None else features
+        self.features = features = SteerableFeatures() if features is None else features
+        sizes: dict[str, Any] = {"multiple": features.multiple, "least": features.least}
         self.statistic, self.content_by = statistic, content_by
         self.levels, self.content_layer = tuple(levels), content_layer
-        crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
+        crops = style_crops(picture, side=crop, **sizes)
         self.crop = crops.shape[-1]
         with torch.no_grad():
             self._remember(crops)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,9 +59,9 @@ def paint(
     if photo is not None and (photo.ndim != 3 or photo.shape[0] != 3):
         raise ValueError(f"a photo is one picture (3,H,W), got shape {tuple(photo.shape)}.")
     height, width = photo.shape[-2:] if photo is not None else shape or (0, 0)
-    multiple, least = loss.features.multiple, loss.features.least
+    multiple, least = (int(size) for size in (loss.features.multiple, loss.features.least))
     rows, columns = (max(least, math.ceil(size / multiple) * multiple) for size in (height, width))
-    device = loss.quantiles.device
+    device: Any = loss.quantiles.device
     scene = None
     if photo is not None:
         scene = F.pad(photo[None].float().to(device), (0, columns - width, 0, rows - height), mode="replicate")

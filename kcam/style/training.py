@@ -416,7 +416,7 @@ class _Run:
 
     def state(self) -> dict[str, Any]:
         """All that the next steps depend on: tensors and plain values."""
-        moments, groups = optimiser_state(self.optimiser, {p: name for name, p in self.named.items()})
+        moments, groups = optimiser_state(self.optimiser, self._by_parameter())
         tensors = {f"camera/{name}": value for name, value in self.camera.state_dict().items()}
         tensors |= {f"average/{name}": value for name, value in self.average.items()}
         tensors |= moments
@@ -433,9 +433,13 @@ class _Run:
         }
         return {"tensors": {name: value.detach().clone() for name, value in tensors.items()}, "document": document}
 
+    def _by_parameter(self) -> dict[Tensor, str]:
+        return {p: name for name, p in self.named.items()}
+
     def _identity(self) -> dict[str, Any]:
         """What must be the same for a run to go on."""
-        style = hashlib.sha256(self.loss.quantiles.cpu().numpy().tobytes()).hexdigest()[:16]
+        quantiles = self.loss.quantiles.detach().cpu().numpy()
+        style = hashlib.sha256(quantiles.tobytes()).hexdigest()[:16]
         settings, loss = dataclasses.asdict(self.settings), self.loss
         return {
             "settings": {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()},
@@ -480,8 +484,7 @@ class _Run:
         self.camera.load_state_dict(group("camera/"))
         for name, value in group("average/").items():
             self.average[name].copy_(value)
-        names = {p: name for name, p in self.named.items()}
-        load_optimiser_state(self.optimiser, names, tensors, document["optimiser"])
+        load_optimiser_state(self.optimiser, self._by_parameter(), tensors, document["optimiser"])
         self.step, self.returns, self.slower = document["step"], document["returns"], document["slower"]
         self.names, self.advice = tuple(document["names"]), list(document["advice"])
         self.history = tensors["history"].tolist()

@@ -1,0 +1,165 @@
+"""`kcam train`, `kcam paint` and `kcam shoot` with what was trained: files, resuming, errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcam import files, plots, train
+from kcam.camera import Camera
+from kcam.cli import app, duration
+from kcam.scene import Scene
+from kcam.style import painting
+
+SMALL = {"steps": 3, "size": 64, "batch": 1}
+
+
+def run(out: Path, *, resume: bool = False, threads: int | None = 1, advance=None, **changes):
+    lines: list[str] = []
+    chosen = {"style": "strokes", "out": str(out), "stage": False} | SMALL | changes
+    options = train.Options(**chosen)
+    return train.run(options, resume=resume, threads=threads, advance=advance, say=lines.append), lines
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "strokes.safetensors"
+    run(out, stage=True)
+    return out
+
+
+def test_it_writes_a_camera_and_a_report(trained: Path) -> None:
+    folder = trained.with_suffix("")
+    assert {path.name for path in folder.iterdir()} == {
+        "checkpoints", "config.json", "sheet.png", "loss.png", "report.html"
+    }  # fmt: skip
+    configuration = json.loads((folder / "config.json").read_text())
+    assert configuration["options"]["style"] == "strokes"
+    assert configuration["settings"]["steps"] == 3
+    assert configuration["threads"] == 1
+    assert "http" not in (folder / "report.html").read_text().replace("http-equiv", "")
+    camera = Camera.load(trained)
+    scene = Scene.builtin("coffee", 64)
+    shots = [camera(scene, generator=torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    assert torch.equal(shots[0], shots[1])
+    assert not torch.equal(shots[0], shots[2])
+    assert files.describe(trained)["configuration"]["class"] == "Camera"
+
+
+def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) -> None:
+    """SIGTERM after the first step; then --resume."""
+    out = tmp_path / "strokes.safetensors"
+
+    def stop_once(progress, steps: int) -> None:
+        if progress.step == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    result, lines = run(out, stage=True, advance=stop_once)
+    assert not result.finished
+    assert lines == ["stopped after 1 of 3 steps; go on with --resume"]
+    assert not out.exists()
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    result, _ = run(out, stage=True, resume=True, threads=None)
+    assert result.finished
+    assert out.read_bytes() == trained.read_bytes()
+
+
+def test_a_run_goes_on_with_its_own_options(tmp_path: Path) -> None:
+    out = tmp_path / "a.safetensors"
+    run(out)
+    with pytest.raises(ValueError, match=r"a holds a run. Go on with --resume, choose another --out"):
+        run(out)
+    with pytest.raises(ValueError, match=r"was begun with seed = 0, not 1. Use the same options"):
+        run(out, resume=True, seed=1)
+    picture = tmp_path / "style.png"
+    plots.write_picture(painting("woodcut", size=128), picture)
+    out = tmp_path / "b.safetensors"
+    run(out, style=str(picture))
+    plots.write_picture(painting("mosaic", size=128), picture)
+    with pytest.raises(ValueError, match=r"style.png is not the picture that .*b was begun with"):
+        run(out, style=str(picture), resume=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"style": "monet"}, r'unknown style "monet": expected a picture file, or one of strokes'),
+        ({"style": "no.png"}, r"there is no file no.png"),
+        ({"preset": "slow"}, r'unknown preset "slow"; there are: quick, standard, thesis'),
+        ({"features": "resnet"}, r'unknown features "resnet"; there are: steerable, vgg16'),
+        ({"features": "vgg16"}, r"needs --vgg-weights: the path of torchvision's vgg16-397923af.pth"),
+        ({"vgg_weights": "w.pth"}, r"--vgg-weights are for --features vgg16"),
+        ({"style_size": 4096}, r"style size 4096 is not within 1..512"),
+        ({"style_size": 32}, r"a style of 32 x 32 is too small"),
+        ({"patches": "nowhere"}, r"nowhere"),
+        ({"camera": "nothing.safetensors"}, r"there is no file nothing.safetensors"),
+        ({"out": "styled.pt"}, r"cannot write styled.pt: a camera's name ends in .safetensors"),
+        ({"out": "/nowhere/at/all.safetensors"}, r"there is no folder /nowhere/at"),
+    ],
+)
+def test_errors(tmp_path: Path, monkeypatch, changes: dict, match: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ValueError, FileNotFoundError), match=match):
+        run(Path(changes.pop("out", "a.safetensors")), **changes)
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+def test_a_gray_style_and_a_smaller_one(tmp_path: Path) -> None:
+    path = tmp_path / "gray.png"
+    plots.write_picture(painting("woodcut", size=(96, 160)).mean(0, keepdim=True), path)
+    picture = train.style_picture(str(path))
+    assert picture.shape == (3, 96, 160)
+    assert torch.equal(picture[0], picture[1])
+    small = train.style_picture(str(path), size=80)
+    assert small.shape == (3, 48, 80)
+    light, kept = (Scene.from_rgb(p, illuminant="E").coefficients.mean() for p in (picture, small))
+    assert kept == pytest.approx(light, rel=0.01)  # filtered in linear light
+
+
+def test_it_starts_from_a_saved_camera(tmp_path: Path, trained: Path) -> None:
+    out = tmp_path / "again.safetensors"
+    result, _ = run(out, camera=str(trained), steps=1)
+    assert any(type(stage).__name__ == "StyleStage" for stage in result.camera)
+
+
+def test_threads_are_put_back(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    run(tmp_path / "a.safetensors", threads=1, steps=1)
+    assert torch.get_num_threads() == before
+    with pytest.raises(ValueError, match=r"threads must be at least 1, got 0"):
+        run(tmp_path / "b.safetensors", threads=0)
+
+
+def test_train_shoot_and_paint_as_commands(tmp_path: Path, trained: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = "train strokes --steps 1 --size 64 --batch 1 --no-stage --threads 1 --profile --out a.safetensors"
+    result = CliRunner().invoke(app, command.split())
+    assert result.exit_code == 0, result.output
+    assert "a.safetensors\na/report.html" in result.output
+    assert "s a step" in result.output
+    plots.write_picture(Scene.builtin("chelsea", 96).to_srgb()[0], "photo.png")
+    result = CliRunner().invoke(app, f"shoot photo.png --camera {trained} --out shot.png --seed 3".split())
+    assert result.exit_code == 0, result.output
+    assert Path("shot.png").exists()
+    result = CliRunner().invoke(app, ["paint", "photo.png", "--style", "woodcut", "--steps", "2", "--size", "64", "--out", "painted.png"])
+    assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(app, ["paint", "--style", "woodcut", "--steps", "2", "--size", "64", "--out", "texture.png"])
+    assert result.exit_code == 0, result.output
+    assert Scene.from_file("texture.png").shape == (1, 64, 64)
+    assert Scene.from_file("painted.png").shape[2] == 64
+    result = CliRunner().invoke(app, ["paint", "--style", "nothing", "--out", "texture.png"])
+    assert result.exit_code == 2
+    assert 'unknown style "nothing"' in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(3.2, "3 s"), (200, "3.3 min"), (8000, "2.2 h"), (500_000, "5.8 days")]
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
