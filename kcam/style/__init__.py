@@ -7,6 +7,7 @@ from kcam.style.pictures import STYLES, painting
 from kcam.style.presets import PRESETS, Preset, style_camera
 from kcam.style.scenes import BuiltinScenes, PatchScenes, Source
 from kcam.style.training import Progress, Settings, StyleWarning, Trained, TrainingError, fit
+from kcam.style.vgg import VGG16Features
 
 __all__ = [
     "PRESETS",
@@ -22,6 +23,7 @@ __all__ = [
     "StyleWarning",
     "Trained",
     "TrainingError",
+    "VGG16Features",
     "fit",
     "paint",
     "painting",
