@@ -71,7 +71,7 @@ def by_numpy(picture: Tensor, state: dict[str, Tensor], *, pool: str = "max") ->
         height, width = x.shape[1:]
         weight = state[f"features.{index}.weight"].double().numpy()
         around = np.pad(x, ((0, 0), (1, 1), (1, 1)))
-        total = np.broadcast_to(state[f"features.{index}.bias"].double().numpy()[:, None, None], (len(weight), *x.shape[1:]))
+        total = state[f"features.{index}.bias"].double().numpy()[:, None, None]
         for i in range(3):
             for j in range(3):
                 total = total + np.tensordot(weight[:, :, i, j], around[:, i : i + height, j : j + width], 1)
@@ -85,7 +85,7 @@ def agree(found: dict[str, Tensor], expected: dict[str, np.ndarray]) -> None:
     assert list(found) == list(expected)
     for name, layer in found.items():
         assert layer.shape[1:] == expected[name].shape
-        # float32 sums of up to 4608 products, ten layers deep: 1e-6 measured, and 1 for a kernel the other way round.
+        # float32 sums of up to 4608 products, ten layers deep: 5e-7 measured, and 1 for a kernel that is turned.
         assert np.abs(layer[0].numpy() - expected[name]).max() < 1e-5 * expected[name].max(), name
 
 
@@ -160,7 +160,7 @@ def test_mixed_precision(file: Path, features: VGG16Features, device: torch.devi
             if precision is None and device.type == "cpu":
                 assert error == 0
             else:
-                # bfloat16 has 8 bits: half a step is 2e-3, ten layers deep 8e-3 at most measured; TF32 has 2e-4
+                # bfloat16 has 8 bits: half a step is 2e-3, ten layers deep 4e-3 to 8e-3 measured
                 assert 1e-3 < error < 3e-2
 
 
@@ -194,11 +194,11 @@ def test_in_the_loss(features: VGG16Features, statistic: str):
     loss = StyleLoss(style, features=features, statistic=statistic, content_by="features", content=0.5)
     own = loss.terms(style[None], style[None])
     assert own["content"] == 0
-    # Sums in another order: 4e-13 of the loss of noise measured; another painting's is 1e-2 to 1 of it.
+    # 0 measured; another painting's loss is .6 to .9 of that of noise, these weights being random.
     noise = pictures(1, 3, 64, 64).requires_grad_()
     other = loss.terms(noise, style[None])
     assert own["style"] < 1e-9 * other["style"]
-    assert loss.terms(painting("mosaic", size=64)[None], style[None])["style"] > 1e-3 * other["style"]
+    assert loss.terms(painting("mosaic", size=64)[None], style[None])["style"] > 0.1 * other["style"]
     expected = 0.5 * (features(noise)["relu3_3"] - features(style[None])["relu3_3"]).square().mean()
     assert other["content"].item() == pytest.approx(expected.item(), rel=1e-6)
     sum(other.values()).backward()
@@ -225,8 +225,8 @@ def test_flat_styles_stay_finite(features: VGG16Features, level: float):
         picture.requires_grad_()
         value = loss(picture)
         value.backward()
-        # 1e5 was seen with constant floors in another network; noise on a flat style is 10 to 40 here.
-        assert value < 1e3
+        # Noise on gray 1900, all others under 50: its variance is divided by a tenth of a photograph's, not by 0.
+        assert value < 1e4
         assert picture.grad.isfinite().all()
 
 
@@ -344,7 +344,7 @@ class Writes:
 def test_code_in_a_file_is_not_run(tmp_path: Path, kind: str):
     path = tmp_path / "code.pth"
     torch.save({"features.0.weight": Writes(tmp_path / "ran")} if kind == "code" else nn.Linear(2, 2), path)
-    with pytest.raises(ValueError, match="code.pth is damaged, or holds more than tensors: pickled objects, .* are not"):
+    with pytest.raises(ValueError, match="code.pth is damaged, or holds more than tensors: pickled objects, which could"):
         VGG16Features(path)
     assert not (tmp_path / "ran").exists()
 
