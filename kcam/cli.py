@@ -1,4 +1,7 @@
-"""The command `kcam`: demo, shoot, psf, explain, calibrate, tradeoff. Only here are quantities strings with units."""
+"""The command `kcam`: demo, shoot, psf, explain, calibrate, tradeoff, train, paint.
+
+Only here are quantities strings with units.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from kcam import __version__
 
 if TYPE_CHECKING:
-    from kcam import optics
     from kcam.camera import Camera
     from kcam.scene import Scene
+    from kcam.style import Progress as StepProgress
 
 UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
@@ -98,28 +101,6 @@ def open_scene(name: str, *, size: int) -> Scene:
     raise ValueError(f'unknown scene "{name}": expected one of {", ".join(BUILTIN)}, or a picture file.')
 
 
-def check_not_too_near(imaging: optics.Imaging, distance: float, *, shape: tuple[int, int]) -> None:
-    """ValueError for a distance at which a point's blur is wider than the picture: its light would be lost.
-
-    The blur is the shadow of the aperture, D d (1 / z - 1 / z_focus) wide; inside the focal length no image is real.
-    """
-    lens = imaging.lens
-    width = 2 * float(lens.aperture.semi_aperture().detach())
-    per_vergence = width * float(lens.sensor_distance) / imaging.pixel_pitch  # pixels per 1/m
-    side = min(*shape, *(imaging.psf_shape or ()))
-    focus = 1 / lens.focus_distance
-    focal_length = float(lens.focal_length())
-    nearest = max(1 / (focus + side / per_vergence), focal_length)
-    if distance <= nearest:
-        blur = per_vergence * (1 / distance - focus)
-        reason = f"a point there blurs over {blur:.0f} pixels, of which there are {side}"
-        if distance <= focal_length:
-            reason = f"it is inside the focal length of {focal_length * 1e3:.3g} mm, where nothing has an image"
-        raise ValueError(
-            f'distance {distance:g} m is too near: {reason}. Use --distance "{math.ceil(nearest * 101)} cm" or more.'
-        )
-
-
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """What the user got wrong is one clear line and exit status 2; what we got wrong stays a traceback."""
@@ -176,39 +157,39 @@ def demo(
 
 @app.command()
 def shoot(
-    photo: Annotated[Path, typer.Argument(help="a picture: PNG, JPEG, TIFF, ... of 8 or 16 bits")],
+    photos: Annotated[
+        list[Path], typer.Argument(help="pictures: PNG, JPEG, TIFF, ... of 8 or 16 bits; folders for all in them")
+    ],
     camera: CameraOption = "phone",
     distance: Annotated[str, typer.Option("--distance", help='of the scene, in metres: 2, "50 cm", inf')] = "2 m",
-    out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("shot.png"),
+    out: Annotated[
+        Path, typer.Option("--out", help="the picture to write; of several photos, or of a folder, the folder")
+    ] = Path("shot.png"),
     seed: SeedOption = 0,
+    size: Annotated[
+        int, typer.Option("--size", min=0, help="longer side [pixels]: strokes do not shrink with it; 0: as it is")
+    ] = 0,
     tolerance: Annotated[str, typer.Option("--tolerance", help=TOLERANCE)] = "",
 ) -> None:
-    """Photograph a photograph: what this camera would have seen at that distance. The picture keeps its size."""
+    """Photograph photographs: what this camera would have seen at that distance. A picture keeps its size."""
     with one_line_errors():
-        import torch
+        from kcam import shoot as module
 
-        from kcam import optics, plots
-        from kcam.scene import Scene
-
-        plots.check_writable(out)
-        if out.exists() and photo.exists() and out.samefile(photo):
-            raise ValueError(f"{out} is the photo itself, which would be lost. Choose another name for --out.")
         stages = open_camera(camera)
-        scene = Scene.from_file(photo, depth=length(distance))
-        for stage in stages:
-            if isinstance(stage, optics.Imaging):
-                check_not_too_near(stage, length(distance), shape=scene.shape[1:])
-        generator = torch.Generator().manual_seed(seed)
-        if tolerance:
-            with torch.no_grad(), progress("plan"):
-                stages = stages.plan(scene, tolerance=as_tolerance(tolerance)).apply(stages)
-        with torch.no_grad(), progress("shoot", total=len(stages)) as advance:
-            for name, picture in stages.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
-                advance(name)
-        if picture.shape[1] != 3:
-            raise ValueError(f"camera {camera} gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
-        plots.write_picture(picture[0].clamp(0, 1), out)
-        typer.echo(out)
+        pairs = module.outputs(photos, out)
+        with progress("shoot", total=len(pairs)) as advance:
+            for photo, target in pairs:
+                module.shoot(
+                    stages,
+                    photo,
+                    target,
+                    distance=length(distance),
+                    seed=seed,
+                    size=size or None,
+                    tolerance=as_tolerance(tolerance) if tolerance else None,
+                )
+                advance(photo.name)
+                typer.echo(target)
 
 
 @app.command()
@@ -339,6 +320,149 @@ def _is_doe(part: object) -> bool:
     from kcam import optics
 
     return isinstance(part, optics.DOE)
+
+
+@app.command()
+def train(
+    style: Annotated[str, typer.Argument(help="a picture, or strokes, mosaic, woodcut, watercolour: kcam's own")],
+    out: Annotated[Path, typer.Option("--out", help="the camera to write; its run's folder stands beside it")] = Path(
+        "styled.safetensors"
+    ),
+    preset: Annotated[str, typer.Option("--preset", help="quick, standard or thesis")] = "quick",
+    patches: Annotated[str, typer.Option("--patches", help="a patch store; without one, the built-in scenes")] = "",
+    camera: Annotated[str, typer.Option("--camera", help="a saved camera to start from")] = "",
+    stage: Annotated[bool, typer.Option("--stage/--no-stage", help="with a style stage, or the camera alone")] = True,
+    features: Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")] = "steerable",
+    vgg_weights: Annotated[str, typer.Option("--vgg-weights", help="torchvision's vgg16-397923af.pth")] = "",
+    style_size: Annotated[
+        int, typer.Option("--style-size", min=0, help="shrink the style to this longer side [pixels]; 0: as it is")
+    ] = 0,
+    steps: Annotated[int, typer.Option("--steps", min=0, help="0: the preset's")] = 0,
+    batch: Annotated[int, typer.Option("--batch", min=0, help="scenes per step; 0: the preset's")] = 0,
+    size: Annotated[int, typer.Option("--size", min=0, help="of the crops [pixels]; 0: the preset's")] = 0,
+    content: Annotated[float, typer.Option("--content", help="weight of the scene; -1: the preset's")] = -1.0,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", min=0.0, help="train through a plan within this error; 0: the reference")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="of scenes, crops and noise")] = 0,
+    device: Annotated[str, typer.Option("--device", help="cpu or cuda")] = "cpu",
+    threads: Annotated[int, typer.Option("--threads", min=0, help="0: the cores that are free")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="print where a step's time goes")] = False,
+) -> None:
+    """Train a camera to take its pictures in the manner of a painting."""
+    with one_line_errors():
+        from kcam import train as module
+
+        options = module.Options(
+            style=style,
+            out=str(out),
+            preset=preset,
+            patches=patches or None,
+            camera=camera or None,
+            features=features,
+            vgg_weights=vgg_weights or None,
+            stage=stage,
+            style_size=style_size or None,
+            steps=steps or None,
+            batch=batch or None,
+            size=size or None,
+            content=None if content < 0 else content,
+            tolerance=tolerance or None,
+            seed=seed,
+            device=device,
+        )
+        with training_progress() as advance:
+            trained = module.run(options, resume=resume, threads=threads or None, advance=advance, say=err.print)
+        if profile:
+            done = sum(trained.profile.values())
+            for part, seconds in trained.profile.items():
+                typer.echo(f"{part:10} {seconds / max(1, trained.steps_timed):8.3f} s a step  {seconds / done:4.0%}")
+        if trained.finished:
+            typer.echo(f"{out}\n{out.with_suffix('')}/report.html")
+        else:
+            raise typer.Exit(3)
+
+
+@contextmanager
+def training_progress() -> Iterator[Callable[..., None]]:
+    """Terms of the loss and the time left: a bar on a terminal, else a line every so often."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("train", total=None)
+        first: list[tuple[int, float]] = []
+
+        def advance(progress: StepProgress, steps: int) -> None:
+            first.append((progress.step, progress.seconds)) if not first else None
+            terms = "  ".join(f"{name} {value:.3f}" for name, value in progress.terms.items())
+            bar.update(task, completed=progress.step, total=steps, description=f"step {progress.step}: {terms}")
+            done = progress.step - first[0][0]
+            if done > 0 and (done == 5 or progress.step % 50 == 0):
+                each = (progress.seconds - first[0][1]) / done
+                left = duration(each * (steps - progress.step))
+                whole = duration(each * steps)
+                if done == 5:
+                    err.print(f"{each:.3g} s a step: {steps} steps take {whole}")
+                if not err.is_terminal and progress.step % 50 == 0:
+                    err.print(f"step {progress.step} of {steps}, {left} left:  {terms}", markup=False)
+
+        yield advance
+
+
+def duration(seconds: float) -> str:
+    """A time for people, from seconds to days."""
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+@app.command()
+def paint(
+    photo: Annotated[str, typer.Argument(help="what the picture shows; without one, a texture of the style")] = "",
+    style: Annotated[
+        str, typer.Option("--style", help="a picture, or strokes, mosaic, woodcut, watercolour")
+    ] = "strokes",
+    out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("painted.png"),
+    start: Annotated[str, typer.Option("--start", help="photo, or noise: from what to paint")] = "",
+    features: Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")] = "steerable",
+    vgg_weights: Annotated[str, typer.Option("--vgg-weights", help="torchvision's vgg16-397923af.pth")] = "",
+    style_size: Annotated[
+        int, typer.Option("--style-size", min=0, help="shrink the style to this longer side [pixels]; 0: as it is")
+    ] = 0,
+    size: Annotated[int, typer.Option("--size", min=64, help="longer side of the painting [pixels]")] = 512,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="of the optimiser")] = 200,
+    content: Annotated[float, typer.Option("--content", min=0.0, help="weight of what the photo shows")] = 0.3,
+    seed: SeedOption = 0,
+) -> None:
+    """Paint a photograph in the manner of a style, or a texture of the style: the picture itself is optimised."""
+    with one_line_errors():
+        from kcam import plots, train
+        from kcam.scene import Scene, read_picture
+        from kcam.style import StyleLoss
+        from kcam.style import paint as optimise
+
+        plots.check_writable(out)
+        picture = train.style_picture(style, size=style_size or None)
+        weights = {"content": content if photo else 0.0}
+        loss = StyleLoss(picture, features=train.style_features(features, vgg_weights or None), **weights)
+        shown = None
+        if photo:
+            shown = read_picture(photo).expand(3, -1, -1)
+            if max(shown.shape[-2:]) > size:
+                shown = Scene.from_rgb(shown, illuminant="D65").resized(size).to_srgb()[0]
+        with progress("paint", total=steps) as advance:
+            painted = optimise(
+                loss,
+                photo=shown,
+                shape=(size, size),
+                start=start or None,
+                steps=steps,
+                seed=seed,
+                advance=lambda step, terms: advance("  ".join(f"{name} {value:.3f}" for name, value in terms.items())),
+            )
+        plots.write_picture(painted, out)
+        typer.echo(out)
 
 
 def main() -> None:

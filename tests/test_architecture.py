@@ -26,7 +26,8 @@ LAYERS = [
     {"kcam.augmentation", "kcam.data", "kcam.style"},
     {"kcam.tradeoff"},
     {"kcam.plots"},
-    {"kcam.demo"},
+    {"kcam.report"},
+    {"kcam.demo", "kcam.shoot", "kcam.train"},
     {"kcam.cli"},
     {"kcam.__main__"},
 ]

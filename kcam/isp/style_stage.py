@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,9 @@ from kcam.context import Context, Stage
 SEEN_AT_ONCE = 2**20
 """Pixels; a larger picture is painted in tiles."""
 TILE = 512
+LENGTH = 6.0
+"""Standard deviation of drawn-out noise along its direction [pixels]."""
+LONGEST = 12
 WINDOWS = 4
 """Across and down: where the statistics of a picture in tiles are taken."""
 DARKEST = 0.03
@@ -68,7 +72,9 @@ class StyleStage(Stage):
 
     Down to a quarter of the size in two strided convolutions, dilated residual blocks, back up by nearest neighbours.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
-    the picture and at a quarter of its size, let strokes grow there (as in texture networks). As it is built it changes
+    the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
+    Gaussians 6 pixels long and 1 wide, along directions that divide the half circle: from white noise alone a small
+    network learns grain before it learns strokes. As it is built it changes
     nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
     The noise comes from the context's generator: the same generator state, picture and weights give the same bytes. A
@@ -77,7 +83,8 @@ class StyleStage(Stage):
 
     Args:      width: channels at full size; twice and four times as many at half and a quarter.
                dilations: of the residual blocks.
-               noise: planes at full size, and at a quarter.
+               noise: planes of white noise at full size, of noise drawn out along as many directions, and of white
+               noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
     Raises:    ValueError for a width, a dilation or a number of planes that is not positive, a negative level, and at
                the call for another number of channels than 3.
@@ -90,7 +97,7 @@ class StyleStage(Stage):
         *,
         width: int = 16,
         dilations: Sequence[int] = (1, 2, 4, 1),
-        noise: tuple[int, int] = (3, 8),
+        noise: tuple[int, int, int] = (1, 4, 4),
         level: float = 1.0,
     ) -> None:
         super().__init__()
@@ -101,10 +108,10 @@ class StyleStage(Stage):
             raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.noise, self.level = width, tuple(dilations), tuple(noise), level
         half, quarter = 2 * width, 4 * width
-        self.enter, self.enter_norm = _Conv(3 + noise[0], width, 5), _Norm(width)
+        self.enter, self.enter_norm = _Conv(3 + noise[0] + noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
         self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
-        self.mix = _Conv(quarter + noise[1], quarter, 1)
+        self.mix = _Conv(quarter + noise[2], quarter, 1)
         self.blocks = nn.ModuleList(_Residual(quarter, dilation) for dilation in self.dilations)
         self.up1, self.up1_norm = _Conv(quarter, half, 3), _Norm(half)
         self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
@@ -129,6 +136,7 @@ class StyleStage(Stage):
     def mean(self) -> StyleStage:
         """The stage without its noise: one picture of those that it paints, not their mean. Shares the weights."""
         quiet = StyleStage(width=self.width, dilations=self.dilations, noise=self.noise, level=0.0)
+        quiet.colour = self.colour
         for name, module in self.named_children():
             setattr(quiet, name, module)
         return quiet
@@ -150,13 +158,22 @@ class StyleStage(Stage):
     def _noise(self, picture: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Planes at full size and at a quarter, for the whole picture."""
         batch, _, height, width = picture.shape
-        where = {"dtype": picture.dtype, "device": picture.device}
-        shapes = ((batch, self.noise[0], height, width), (batch, self.noise[1], height // 4, width // 4))
+        where: dict[str, Any] = {"dtype": picture.dtype, "device": picture.device}
+        white, drawn_out, at_quarter = self.noise
         if self.level == 0:
-            return picture.new_zeros(shapes[0]), picture.new_zeros(shapes[1])
+            fine = picture.new_zeros(batch, white + drawn_out, height, width)
+            return fine, picture.new_zeros(batch, at_quarter, height // 4, width // 4)
         if generator is not None and generator.device != picture.device:
             where["device"] = generator.device
-        fine, coarse = (torch.randn(shape, generator=generator, **where).to(picture.device) for shape in shapes)
+        around = 2 * LONGEST
+        shapes = ((white, height, width), (drawn_out, height + around, width + around))
+        fine, strokes, coarse = (
+            torch.randn(batch, *shape, generator=generator, **where).to(picture.device)
+            for shape in (*shapes, (at_quarter, height // 4, width // 4))
+        )
+        if drawn_out:
+            strokes = F.conv2d(strokes, stroke_kernels(drawn_out).to(picture), groups=drawn_out)
+            fine = torch.cat([fine, strokes], dim=1)
         return self.level * fine, self.level * coarse
 
     def _paint(
@@ -171,8 +188,8 @@ class StyleStage(Stage):
         x = self.mix(torch.cat([x, noise[1]], dim=1))
         for block in self.blocks:
             x = block(x, *how)
-        x = F.relu(self.up1_norm(self.up1(F.interpolate(x, scale_factor=2, mode="nearest")), *how))
-        x = F.relu(self.up2_norm(self.up2(F.interpolate(x, scale_factor=2, mode="nearest")), *how))
+        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
+        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
         return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
@@ -193,6 +210,20 @@ class StyleStage(Stage):
                     height, width = inner[2] - inner[0], inner[3] - inner[1]
                     result[index, :, top : inner[2], left : inner[3]] = painted[0, :, y : y + height, x : x + width]
         return result
+
+
+def stroke_kernels(count: int) -> Tensor:
+    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25), of squares that sum to 1."""
+    place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
+    y, x = torch.meshgrid(place, place, indexing="ij")
+    angle = torch.arange(count, dtype=torch.float64)[:, None, None] * (math.pi / count)
+    along, across = x * torch.cos(angle) + y * torch.sin(angle), y * torch.cos(angle) - x * torch.sin(angle)
+    kernels = torch.exp(-(along**2) / (2 * LENGTH**2) - across**2 / 2)
+    return (kernels / kernels.square().sum((-2, -1), keepdim=True).sqrt())[:, None]
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
 def _cut(planes: tuple[Tensor, ...], top: int, left: int, bottom: int, right: int) -> tuple[Tensor, Tensor]:

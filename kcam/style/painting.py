@@ -16,6 +16,7 @@ from kcam.style.losses import StyleLoss
 STARTS = ("photo", "noise")
 NOISE = 0.15  # RMS of the white noise that a picture may start from, around gray
 GRAY = 0.45
+CORNERS = 0.1
 
 
 def paint(
@@ -25,7 +26,7 @@ def paint(
     shape: tuple[int, int] | None = None,
     start: str | None = None,
     steps: int = 200,
-    rate: float = 0.03,
+    rate: float = 0.1,
     seed: int = 0,
     advance: Callable[[int, dict[str, float]], None] | None = None,
 ) -> Tensor:
@@ -87,9 +88,14 @@ def paint(
 
 
 def spectral_scale(height: int, width: int) -> Tensor:
-    """The 1 / f that a picture's spectrum falls by, (H, W/2+1), 1 / max(f, 1 / longer side), of mean square 1."""
-    rows, columns = torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)
-    scale = 1 / torch.hypot(rows, columns).clamp(min=1 / max(height, width))
+    """The 1 / f that a picture's spectrum falls by, (H, W/2+1), of mean square 1.
+
+    Beyond 0.5 cycles per pixel, in the corners of the spectrum, features see little: there it is a tenth, or noise
+    would grow.
+    """
+    frequency = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width))
+    scale = 1 / frequency.clamp(min=1 / max(height, width))
+    scale = torch.where(frequency > 0.5, CORNERS * scale, scale)
     return scale / scale.square().mean().sqrt()
 
 

@@ -13,8 +13,12 @@ from kcam.data import PatchDataset
 from kcam.scene import PHOTOGRAPHS, Scene
 from kcam.style.draws import philox
 
-SCALES = (1.0, 0.75, 0.55, 0.4)
+SCALES = (2.0, 1.0, 0.7, 0.4)
 """Of the built-in photographs: strokes are as wide whatever the scale of what they show."""
+DIMMEST, BRIGHTEST = -3.0, 0.3
+"""Stops by which half of the scenes are lit otherwise: a camera meets dark pictures too."""
+TINT = 1.5
+"""Stops by which the colours of half of the scenes are changed: four photographs hold few."""
 DISTANCE = 2.0
 
 
@@ -31,7 +35,10 @@ class Source(Protocol):
 
 
 class BuiltinScenes:
-    """Square crops of the built-in photographs, at four scales, some mirrored, 2 m away.
+    """Square crops of the built-in photographs, 2 m away, at four scales.
+
+    So that a camera that saw four photographs can take others, half of the crops are mirrored, half lit by up to 3
+    stops less, and half in other colours: channels swapped, and each dimmed by up to 1.5 stops.
 
     Args:      size: of the crops [pixels], at most 300.
                names: of the photographs; by default all.
@@ -62,6 +69,12 @@ class BuiltinScenes:
             name, scene = self.scenes[random.integers(len(self.scenes))]
             top, left = (int(random.integers(length - self.size + 1)) for length in scene.shape[1:])
             crop = scene.coefficients[..., top : top + self.size, left : left + self.size]
+            if random.integers(2):
+                crop = crop * 2 ** random.uniform(DIMMEST, BRIGHTEST)
+            if random.integers(2):
+                stops = torch.from_numpy(random.uniform(-TINT, BRIGHTEST, 3)).to(crop)
+                crop = crop[:, random.permutation(3)] * (2**stops)[:, None, None]
+            crop = crop.clamp(max=1)
             planes.append(crop.flip(-1) if random.integers(2) else crop)
             origins.append(f"{name}, row {top}, column {left}")
         _, first = self.scenes[0]
@@ -70,6 +83,8 @@ class BuiltinScenes:
 
 class PatchScenes:
     """Patches of a store that `data_tools/extract_patches.py` wrote, 2 m away; on reflectances daylight falls.
+
+    Half of them are mirrored, and half lit by up to 3 stops less, by a light up to 1.5 stops bluer or redder.
 
     Args:      patches: the split's folder, or a store, whose "train" is then taken.
                size: side of the crop that is taken of each patch [pixels]; None: the whole patch.
@@ -104,6 +119,9 @@ class PatchScenes:
             patch = patch * self.light if scene in self.reflecting else patch
             top, left = (int(random.integers(length - self.size + 1)) for length in patch.shape[1:])
             crop = patch[:, top : top + self.size, left : left + self.size]
+            if random.integers(2):
+                tilt = torch.linspace(-0.5, 0.5, len(crop)) * random.uniform(-TINT, TINT)
+                crop = crop * (2 ** (random.uniform(DIMMEST, BRIGHTEST) + tilt))[:, None, None]
             values.append(crop.flip(-1) if random.integers(2) else crop)
             name, y, x = self.patches.position(index)
             origins.append(f"{name}, row {y + top}, column {x + left}")

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from kcam import isp, optics, sensor
 from kcam.camera import DEMOSAICING, Camera
-from kcam.planner import Plan, PlannedCamera
+from kcam.planner import Plan
 from kcam.scene import Scene
 from kcam.style.checkpoints import Checkpoints
 from kcam.style.draws import torch_generator
@@ -114,15 +114,18 @@ class Trained:
     """A trained camera and how it came about.
 
     camera: with the averaged weights. history: (N, 1 + terms) float64, total and terms of each step. names: of its
-    columns. profile: seconds by part of a step. advice: warnings that were given. plan: the last one, if any.
+    columns. profile: seconds by part of a step, over the `steps_timed` that this call took. advice: warnings that were
+    given. plan: the last one, if any. finished: whether all steps were taken.
     """
 
     camera: Camera
     history: Tensor
     names: tuple[str, ...]
     profile: dict[str, float]
+    steps_timed: int
     advice: tuple[str, ...]
     plan: Plan | None
+    finished: bool
 
 
 def part_of(stage: nn.Module) -> str | None:
@@ -244,7 +247,16 @@ def fit(
         if stopped:
             break
     run.finish()
-    return Trained(camera, run.table(), run.names, run.clock.seconds, tuple(run.advice), run.plan)
+    return Trained(
+        camera,
+        history=run.table(),
+        names=run.names,
+        profile=run.clock.seconds,
+        steps_timed=run.clock.steps,
+        advice=tuple(run.advice),
+        plan=run.plan,
+        finished=run.step >= settings.steps,
+    )
 
 
 class _Run:
@@ -364,7 +376,8 @@ class _Run:
         pairs = torch.stack([luminance(picture).flatten(1), shown], dim=1)
         alike = float(torch.stack([torch.corrcoef(pair)[0, 1] for pair in pairs]).nan_to_num(1.0).mean())
         clipped = float(((picture <= 1 / 512) | (picture >= 1 - 1 / 512)).float().mean())
-        blind = [i for i, (now, start) in enumerate(zip(self._responses(), self._white, strict=True)) if now < DEAD * start]
+        curves = zip(self._responses(), self._white, strict=True)
+        blind = [index for index, (now, start) in enumerate(curves) if now < DEAD * start]
         for key, happens, text in (
             ("negative", alike < NEGATIVE, f"the pictures look like negatives: luminance correlation {alike:.2f}"),
             ("clipped", clipped > CLIPPED, f"{clipped:.0%} of the pictures is black or white: they clip"),
@@ -405,7 +418,7 @@ class _Run:
         moments, groups = optimiser_state(self.optimiser, {p: name for name, p in self.named.items()})
         tensors = {f"camera/{name}": value for name, value in self.camera.state_dict().items()}
         tensors |= {f"average/{name}": value for name, value in self.average.items()}
-        tensors |= {f"optimiser/{name}": value for name, value in moments.items()}
+        tensors |= moments
         tensors["history"] = self.table()
         document = {
             "step": self.step,
@@ -422,11 +435,11 @@ class _Run:
     def _identity(self) -> dict[str, Any]:
         """What must be the same for a run to go on."""
         style = hashlib.sha256(self.loss.quantiles.cpu().numpy().tobytes()).hexdigest()[:16]
-        settings = dataclasses.asdict(self.settings)
+        settings, loss = dataclasses.asdict(self.settings), self.loss
         return {
             "settings": {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()},
             "style": style,
-            "loss": {"weights": self.loss.weights, "statistic": self.loss.statistic, "content_by": self.loss.content_by},
+            "loss": {"weights": loss.weights, "statistic": loss.statistic, "content_by": loss.content_by},
             "features": self.loss.features.name,
             "parameters": {name: list(p.shape) for name, p in self.named.items()},
         }
@@ -467,7 +480,7 @@ class _Run:
         for name, value in group("average/").items():
             self.average[name].copy_(value)
         names = {p: name for name, p in self.named.items()}
-        load_optimiser_state(self.optimiser, names, group("optimiser/"), document["optimiser"])
+        load_optimiser_state(self.optimiser, names, tensors, document["optimiser"])
         self.step, self.returns, self.slower = document["step"], document["returns"], document["slower"]
         self.names, self.advice = tuple(document["names"]), list(document["advice"])
         self.history = tensors["history"].tolist()
@@ -511,9 +524,11 @@ class _Clock:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.steps = 0
         self._began = self._last = time.perf_counter()
 
     def start(self) -> None:
+        self.steps += 1
         self._last = time.perf_counter()
 
     def mark(self, part: str) -> None:

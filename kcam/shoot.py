@@ -1,0 +1,114 @@
+"""What `kcam shoot` does: photographs of photographs, one file at a time, in bounded memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from kcam import optics, plots
+from kcam.camera import Camera
+from kcam.scene import Scene
+
+LARGE = 2**21
+"""Pixels above which the convolution is cut into tiles."""
+TILE = 1024
+
+
+def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
+    """Which file each photo becomes: `out` itself for one, else a .png of the same name in the folder `out`.
+
+    Raises:    FileNotFoundError, ValueError for a photo that is not there, a folder without pictures, two photos of one
+               name, or a name that cannot be written, before anything is taken.
+    """
+    known = plots.PICTURE_SUFFIXES
+    found: list[Path] = []
+    for photo in photos:
+        inside = sorted(p for p in photo.iterdir() if p.suffix.lower() in known) if photo.is_dir() else []
+        if photo.is_dir() and not inside:
+            raise ValueError(f"there is no picture in the folder {photo}: expected {', '.join(known)}.")
+        found += inside or [photo]
+    single = len(found) == 1 and not photos[0].is_dir() and not out.is_dir() and out.suffix != ""
+    if single:
+        plots.check_writable(out)
+        pairs = [(found[0], out)]
+    else:
+        if out.suffix.lower() in known and not out.is_dir():
+            raise ValueError(f"{len(found)} photos do not fit into the one file {out}. Name a folder: --out shots/.")
+        if out.exists() and not out.is_dir():
+            raise ValueError(f"{out} is a file, and {len(found)} photos need a folder. Use --out shots/.")
+        if not out.absolute().parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {out.parent} to make {out.name} in.")
+        pairs = [(photo, out / f"{photo.stem}.png") for photo in found]
+        twice = [t.name for i, (_, t) in enumerate(pairs) if t in [other for _, other in pairs[:i]]]
+        if twice:
+            raise ValueError(f"two of the photos would both become {twice[0]}. Take them into different folders.")
+    for photo, target in pairs:
+        if not photo.is_file():
+            raise FileNotFoundError(f"there is no file {photo}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
+        if target.exists() and target.samefile(photo):
+            raise ValueError(f"{target} is the photo itself, which would be lost. Choose another name for --out.")
+    return pairs
+
+
+def shoot(
+    camera: Camera,
+    photo: Path,
+    target: Path,
+    *,
+    distance: float,
+    seed: int = 0,
+    size: int | None = None,
+    tolerance: float | str | None = None,
+) -> None:
+    """Photograph a photograph at a distance, and write the picture; the same seed gives the same bytes.
+
+    Args:      size: of the longer side [pixels], to which a larger photo is shrunk first; None: as it is.
+    Raises:    ValueError for a distance that is too near, a size above the photo's, or a camera that gives no picture.
+    """
+    scene = Scene.from_file(photo, depth=distance)
+    longest = max(scene.shape[1:])
+    if size is not None and size > longest:
+        raise ValueError(f"{photo.name} has {longest} pixels on its longer side, and --size asks for {size}.")
+    if size is not None:
+        scene = scene.resized(size)
+    _, height, width = scene.shape
+    stages = list(camera)
+    for index, stage in enumerate(stages):
+        if isinstance(stage, optics.Imaging):
+            check_not_too_near(stage, distance, shape=(height, width))
+            if height * width > LARGE and stage.tile is None:
+                stages[index] = stage.changed(tile=TILE)
+    camera = Camera(*stages, context=camera.context)
+    with torch.no_grad():
+        if tolerance is not None:
+            camera = camera.plan(scene, tolerance=tolerance).apply(camera)
+        picture = camera(scene, generator=torch.Generator().manual_seed(seed))
+    if picture.shape[1] != 3:
+        raise ValueError(f"the camera gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
+    target.parent.mkdir(exist_ok=True)
+    plots.write_picture(picture[0].clamp(0, 1), target)
+
+
+def check_not_too_near(imaging: optics.Imaging, distance: float, *, shape: tuple[int, int]) -> None:
+    """ValueError for a distance at which a point's blur is wider than the picture: its light would be lost.
+
+    The blur is the shadow of the aperture, D d (1 / z - 1 / z_focus) wide; inside the focal length no image is real.
+    """
+    lens = imaging.lens
+    width = 2 * float(lens.aperture.semi_aperture().detach())
+    per_vergence = width * float(lens.sensor_distance) / imaging.pixel_pitch  # pixels per 1/m
+    side = min(*shape, *(imaging.psf_shape or ()))
+    focus = 1 / lens.focus_distance
+    focal_length = float(lens.focal_length())
+    nearest = max(1 / (focus + side / per_vergence), focal_length)
+    if distance <= nearest:
+        blur = per_vergence * (1 / distance - focus)
+        reason = f"a point there blurs over {blur:.0f} pixels, of which there are {side}"
+        if distance <= focal_length:
+            reason = f"it is inside the focal length of {focal_length * 1e3:.3g} mm, where nothing has an image"
+        raise ValueError(
+            f'distance {distance:g} m is too near: {reason}. Use --distance "{math.ceil(nearest * 101)} cm" or more.'
+        )

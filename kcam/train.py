@@ -1,0 +1,280 @@
+"""What `kcam train` does: a run with its folder, its pictures and its report."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcam import __version__, files, plots, report, style
+from kcam.camera import Camera
+from kcam.scene import Scene, read_picture
+from kcam.style.training import Trained
+
+SHOWN = ("astronaut", "coffee", "chelsea")
+SHOWN_SIZE = 192
+FEATURES = ("steerable", "vgg16")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user chooses; `None` leaves it to the preset.
+
+    style: a picture's path, or the name of one of `kcam.style.STYLES`. out: the camera to write, .safetensors; beside
+    it stands a folder of its name with checkpoints, pictures and the report. patches: a patch store; None: the built-in
+    scenes. camera: a saved one to start from. features: "steerable" or "vgg16", with vgg_weights. stage: False trains
+    the camera alone. style_size: longer side that the style is shrunk to; None: as it is.
+    """
+
+    style: str
+    out: str = "styled.safetensors"
+    preset: str = "quick"
+    patches: str | None = None
+    camera: str | None = None
+    features: str = "steerable"
+    vgg_weights: str | None = None
+    stage: bool = True
+    style_size: int | None = None
+    steps: int | None = None
+    batch: int | None = None
+    size: int | None = None
+    content: float | None = None
+    tolerance: float | None = None
+    seed: int = 0
+    device: str = "cpu"
+
+
+def style_picture(name: str, *, size: int | None = None) -> Tensor:
+    """A style, (3,H,W): a picture file, or one of the paintings that kcam makes itself.
+
+    Raises:    FileNotFoundError, ValueError for what is neither, or a size that would enlarge it.
+    """
+    if name in style.STYLES:
+        picture = style.painting(name)
+    elif Path(name).suffix or Path(name).exists():
+        picture = read_picture(name).expand(3, -1, -1)
+    else:
+        raise ValueError(f'unknown style "{name}": expected a picture file, or one of {", ".join(style.STYLES)}.')
+    longest = max(picture.shape[-2:])
+    if size is None or size == longest:
+        return picture.contiguous()
+    if not 1 <= size <= longest:
+        raise ValueError(f"style size {size} is not within 1..{longest}, what the style has: strokes are not enlarged.")
+    return Scene.from_rgb(picture, illuminant="E").resized(size).to_srgb()[0]
+
+
+def run(
+    options: Options,
+    *,
+    resume: bool = False,
+    threads: int | None = None,
+    advance: Callable[[style.Progress, int], None] | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Trained:
+    """Train a camera, and write it, a contact sheet and the loss curve at every checkpoint, and a report at the end.
+
+    Killed at any moment, a run with the same options and `resume` ends in the same camera, bit for bit. Ctrl-C and
+    SIGTERM end it after the step, with a checkpoint. Under torchrun the processes share the batch.
+
+    Args:      threads: None for the cores that are free, or with `resume` as many as the run began with.
+               advance: called after each step with the number of all steps.
+               say: called with lines that a user should read.
+    Raises:    as `kcam.style.fit`; ValueError for options that do not fit together or another run's folder.
+    """
+    out = Path(options.out)
+    if out.suffix != ".safetensors":
+        raise ValueError(f"cannot write {out.name}: a camera's name ends in .safetensors.")
+    if not out.absolute().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {out.name}: there is no folder {out.parent}.")
+    folder = out.with_suffix("")
+    if options.preset not in style.PRESETS:
+        raise ValueError(f'unknown preset "{options.preset}"; there are: {", ".join(style.PRESETS)}.')
+    picture = style_picture(options.style, size=options.style_size)
+    document = {"options": asdict(options), "style": _hash(picture), "threads": _threads(folder, resume, threads)}
+    torch.set_num_threads(document["threads"])
+    with _processes(options.device) as (leads, device):
+        _check_folder(folder, document, resume=resume)
+        preset = style.PRESETS[options.preset]
+        camera = _camera(options, preset).to(device)
+        source = _source(options, preset)
+        changes = {name: getattr(options, name) for name in ("steps", "batch", "size", "tolerance")}
+        settings = preset.for_scenes(
+            len(source), seed=options.seed, **{name: value for name, value in changes.items() if value is not None}
+        )
+        weights = {} if options.content is None else {"content": options.content}
+        features = style_features(options.features, options.vgg_weights)
+        loss = preset.style_loss(picture.to(device), features=features.to(device), **weights).to(device)
+        start = _camera(options, preset)
+        scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0) for name in SHOWN]
+        if leads:
+            folder.mkdir(exist_ok=True)
+            settled = document | {"settings": asdict(settings), "kcam": __version__, "torch": torch.__version__}
+            files.replace(folder / "config.json", (json.dumps(settled, indent=1) + "\n").encode())
+
+        def show(camera: Camera, step: int, history: Tensor, names: Sequence[str]) -> dict[str, Any]:
+            figures = {
+                "sheet": report.style_sheet(camera, style=picture, scenes=scenes, step=step, start=start),
+                "loss": report.loss_figure(history, names),
+            }
+            for name, figure in figures.items():
+                plots.save_figure(figure, folder / f"{name}.png")
+            return figures
+
+        with warnings.catch_warnings(), _stopping() as stopped:
+            warnings.showwarning = lambda message, *_: say(str(message))  # type: ignore[assignment]
+            trained = style.fit(
+                camera,
+                loss,
+                source=source,
+                settings=settings,
+                folder=folder / "checkpoints",
+                resume=resume,
+                advance=None if advance is None else lambda progress: advance(progress, settings.steps),
+                on_checkpoint=lambda camera, step, history: show(camera, step, history, trained_names(loss)),
+                stop=stopped,
+            )
+        if leads and trained.finished:
+            trained.camera.cpu().save(out)
+            figures = show(trained.camera, len(trained.history), trained.history, trained.names)
+            _write_report(folder / "report.html", options, settings, trained, figures)
+        elif leads:
+            say(f"stopped after {len(trained.history)} of {settings.steps} steps; go on with --resume")
+    return trained
+
+
+def trained_names(loss: style.StyleLoss) -> tuple[str, ...]:
+    """The columns of the history."""
+    return ("total", *(name for name, weight in loss.weights.items() if weight))
+
+
+def _camera(options: Options, preset: style.Preset) -> Camera:
+    if options.camera is not None:
+        return Camera.load(options.camera)
+    return preset.camera() if preset.camera is not style.style_camera else style.style_camera(stage=options.stage)
+
+
+def _source(options: Options, preset: style.Preset) -> style.Source:
+    size = options.size or preset.settings.size
+    if options.patches is None:
+        return style.BuiltinScenes(size)
+    return style.PatchScenes(options.patches, size=size)
+
+
+def style_features(name: str, weights: str | None = None) -> Any:
+    """Features by name. Raises: ValueError for an unknown one, or weights that are missing or too many."""
+    if name not in FEATURES:
+        raise ValueError(f'unknown features "{name}"; there are: {", ".join(FEATURES)}.')
+    if name == "steerable":
+        if weights is not None:
+            raise ValueError("--vgg-weights are for --features vgg16; the steerable features have none.")
+        return style.SteerableFeatures()
+    if weights is None:
+        raise ValueError(
+            "--features vgg16 needs --vgg-weights: the path of torchvision's vgg16-397923af.pth. Nothing is "
+            "downloaded; --features steerable works without weights."
+        )
+    return style.VGG16Features(weights)
+
+
+def _hash(picture: Tensor) -> str:
+    return hashlib.sha256(picture.contiguous().numpy().tobytes()).hexdigest()[:16]
+
+
+def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> None:
+    """A folder holds one run: it goes on with the options that it began with."""
+    found = folder / "config.json"
+    if not found.exists():
+        return
+    there = json.loads(found.read_text())
+    if not resume:
+        raise ValueError(f"{folder} holds a run. Go on with --resume, choose another --out, or remove the folder.")
+    for name, value in document["options"].items():
+        if there["options"].get(name) != value:
+            raise ValueError(
+                f"{folder} was begun with {name} = {there['options'].get(name)!r}, not {value!r}. Use the same options."
+            )
+    if there["style"] != document["style"]:
+        raise ValueError(f"{document['options']['style']} is not the picture that {folder} was begun with.")
+
+
+def _threads(folder: Path, resume: bool, threads: int | None) -> int:
+    """How many a run computes with: as it began, for the last bit depends on it; else the cores that are free."""
+    found = folder / "config.json"
+    if threads is None and resume and found.exists():
+        return json.loads(found.read_text())["threads"]
+    if threads is not None:
+        if threads < 1:
+            raise ValueError(f"threads must be at least 1, got {threads}.")
+        return threads
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    free = max(1, min(cores, round(cores - busy)))
+    return max(1, free // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+@contextmanager
+def _processes(device: str) -> Iterator[tuple[bool, torch.device]]:
+    """Whether this process leads, and its device; under torchrun the others are joined."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield True, torch.device(device)
+        return
+    own = torch.device(device, int(os.environ["LOCAL_RANK"])) if device == "cuda" else torch.device(device)
+    torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+    try:
+        yield torch.distributed.get_rank() == 0, own
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+@contextmanager
+def _stopping() -> Iterator[Callable[[], bool]]:
+    """Asks whether Ctrl-C or SIGTERM came; a second one ends at once."""
+    came: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        if came:
+            raise KeyboardInterrupt
+        came.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _write_report(path: Path, options: Options, settings: Any, trained: Trained, figures: dict[str, Any]) -> None:
+    seconds = sum(trained.profile.values())
+    last = dict(zip(trained.names, trained.history[-20:].mean(0).tolist(), strict=True))
+    summary = [
+        ("style", options.style),
+        ("preset", options.preset),
+        ("steps", f"{settings.steps} of {settings.batch} scenes of {settings.size} x {settings.size} pixels"),
+        ("scenes", options.patches or "built-in photographs"),
+        ("features", options.features),
+        ("time", f"{plots.duration(seconds)}, {plots.duration(seconds / max(1, trained.steps_timed))} a step"),
+        *((f"loss: {name}", f"{value:.4f}") for name, value in last.items()),
+        ("versions", f"kcam {__version__}, torch {torch.__version__}, {torch.get_num_threads()} threads"),
+    ]
+    report.write_report(
+        path,
+        title=f"A camera for {Path(options.style).stem}",
+        summary=summary,
+        figures=[("Contact sheet", figures["sheet"]), ("Loss", figures["loss"])],
+        advice=trained.advice,
+        notes=[
+            "A camera alone can bring the colours of a style, not its strokes: its optics only take detail away, its "
+            "filter and matrix act on each pixel. What brings strokes is the style stage, a network behind the camera."
+        ],
+    )
