@@ -119,7 +119,7 @@ def test_natural_is_that_of_the_builtin_photographs(features: SteerableFeatures)
 @pytest.mark.parametrize(
     ("picture", "error", "message"),
     [
-        (torch.rand(1, 3, 72, 64), ValueError, "picture of 72 x 64 has no features: both sides must be multiples of 16"),
+        (torch.rand(1, 3, 72, 64), ValueError, "of 72 x 64 has no features: both sides must be multiples of 16"),
         (torch.rand(1, 3, 150, 30), ValueError, "at least 64 pixels. Crop or resize it, to 144 x 64 for instance."),
         (torch.rand(3, 64, 64), ValueError, "pictures (B,3,H,W), got shape (3, 64, 64). Add the batch: picture[None]."),
         (torch.rand(1, 1, 64, 64), ValueError, "features are taken of pictures (B,3,H,W), got shape (1, 1, 64, 64)."),

@@ -344,7 +344,7 @@ class Writes:
 def test_code_in_a_file_is_not_run(tmp_path: Path, kind: str):
     path = tmp_path / "code.pth"
     torch.save({"features.0.weight": Writes(tmp_path / "ran")} if kind == "code" else nn.Linear(2, 2), path)
-    with pytest.raises(ValueError, match="code.pth is damaged, or holds more than tensors: pickled objects, which could"):
+    with pytest.raises(ValueError, match="code.pth is damaged, or holds more than tensors: pickled objects"):
         VGG16Features(path)
     assert not (tmp_path / "ran").exists()
 
