@@ -171,6 +171,10 @@ class StyleLoss(nn.Module):
                TypeError for what is no picture.
     """
 
+    features: Any
+    quantiles: Tensor
+    deviation: Tensor
+
     def __init__(
         self,
         picture: Tensor,
@@ -199,7 +203,7 @@ class StyleLoss(nn.Module):
             raise ValueError("all weights are 0: no term is left. Give one, such as style=1.")
         if not levels or min(levels) < 1:
             raise ValueError(f"levels must be whole numbers of at least 1, got {levels!r}. Use levels=(1, 2, 4).")
-        self.features: Any = SteerableFeatures() if features is None else features
+        self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
         self.levels, self.content_layer = tuple(levels), content_layer
         crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)

@@ -249,16 +249,15 @@ def reduction(name: str, *, size: int, steps: int) -> float:
     loss = StyleLoss(painting(name, size=256), content=0, crop=size)
     painted = paint(loss, shape=(size, size), steps=steps, advance=lambda _, terms: losses.append(sum(terms.values())))
     assert len(losses) == steps
-    assert loss(painted[None]).item() == pytest.approx(losses[-1], rel=0.2)  # on all directions of colour, not on four
-    return losses[0] / losses[-1]
+    return losses[0] / loss(painted[None]).item()
 
 
 def test_synthesis_cuts_the_loss():
-    assert reduction("watercolour", size=64, steps=50) > 20
+    assert reduction("watercolour", size=64, steps=50) > 30  # 98
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STYLES)
 def test_synthesis_cuts_the_loss_a_hundredfold(name: str):
-    """In 200 steps: strokes 465, mosaic 528, woodcut 132, watercolour 1066 times."""
+    """In 200 steps: strokes 574, mosaic 466, woodcut 246, watercolour 1085 times."""
     assert reduction(name, size=128, steps=200) > 100
