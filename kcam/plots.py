@@ -67,9 +67,14 @@ def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, resolution: float = 144) -> None:
     """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`."""
     check_writable(path, suffixes=FIGURE_SUFFIXES)
+    files.replace(path, figure_bytes(figure, resolution=resolution, format=Path(path).suffix.lower()[1:]))
+
+
+def figure_bytes(figure: Figure, *, resolution: float = 144, format: str = "png") -> bytes:
+    """A figure as the content of a file, at `resolution` dots per inch."""
     content = io.BytesIO()
-    figure.savefig(content, dpi=resolution, facecolor="white", format=Path(path).suffix.lower()[1:])
-    files.replace(path, content.getvalue())
+    figure.savefig(content, dpi=resolution, facecolor="white", format=format)
+    return content.getvalue()
 
 
 def as_image(picture: Tensor) -> np.ndarray:
@@ -83,6 +88,15 @@ def as_image(picture: Tensor) -> np.ndarray:
         raise ValueError(f"a picture has shape (3,H,W) or (1,H,W), got {tuple(picture.shape)}.{hint}")
     image = picture.detach().float().clamp(0, 1).cpu().nan_to_num()
     return image.expand(3, -1, -1).permute(1, 2, 0).numpy()
+
+
+def psf_image(psf: Tensor, colour: np.ndarray) -> np.ndarray:
+    """A PSF (H,W) in the colour of its light, (H,W,3): scaled to its own peak, its square root shown."""
+    return _square_root(psf[..., None].numpy() * colour**2.2)
+
+
+def _square_root(image: np.ndarray) -> np.ndarray:
+    return np.sqrt(image / max(image.max(), 1e-30)) ** (1 / 1.1)
 
 
 def light_colours(wavelengths: Tensor) -> np.ndarray:
@@ -275,11 +289,11 @@ def psf_figure(
         "method": imaging.method,
     }
     psf = lens.psf(colours_at, fill_factor=imaging.fill_factor, **arguments).detach().double().cpu()
-    reach = _reach(psf, share=SHARE_SHOWN)
+    reach = reach_of(psf, share=SHARE_SHOWN)
     window = {"shape": (2 * reach + 1, 2 * reach + 1)}
     daylight = lens.psf(bands, fill_factor=imaging.fill_factor, **(arguments | window)).detach().double().cpu()
     luminance = spectral.xyz_weights(bands, "D65")[:, 1]
-    shares = [_centre(psf, reach).sum((-2, -1)), daylight.sum((-2, -1)) @ luminance / luminance.sum()]
+    shares = [centre(psf, reach).sum((-2, -1)), daylight.sum((-2, -1)) @ luminance / luminance.sum()]
     least = min(float(share.min()) for share in shares)
     daylight = torch.einsum("dlhw,lc->dchw", daylight, spectral.xyz_weights(bands, "D65"))
     daylight = spectral.xyz_to_linear_srgb(daylight).clamp(min=0)
@@ -300,8 +314,7 @@ def psf_figure(
     sheet.text(
         edge,
         0.64,
-        f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, in focus at {metres(focus)};  "
-        f"pixels of {pitch / um:.3g} \u00b5m\n"
+        f"{optics_text(imaging)}\n"
         f"Panels: the middle {2 * reach + 1} of {min(shape)} pixels, with {percent_or_more(least)} of their light; "
         "each scaled to its own peak, square root shown",
         colour=MUTED,
@@ -318,10 +331,9 @@ def psf_figure(
         )
         for column in range(columns):
             if column < len(lit):
-                image = _centre(psf[row, column], reach)[..., None].numpy() * lit[column] ** 2.2
+                image = psf_image(centre(psf[row, column], reach), lit[column])
             else:
-                image = daylight[row].permute(1, 2, 0).numpy()
-            image = np.sqrt(image / max(image.max(), 1e-30)) ** (1 / 1.1)
+                image = _square_root(daylight[row].permute(1, 2, 0).numpy())
             sheet.picture(image, edge + rim + column * (cell + gap), top, cell, cell, smooth=False)
     middle = colours_at[len(colours_at) // 2]
     contrast, energy = (
@@ -356,6 +368,15 @@ def psf_figure(
     return sheet.figure
 
 
+def optics_text(imaging: optics.Imaging) -> str:
+    """The lens and its pixels in a line."""
+    lens = imaging.lens
+    return (
+        f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, "
+        f"in focus at {metres(lens.focus_distance)};  pixels of {float(imaging.pixel_pitch) / um:.3g} \u00b5m"
+    )
+
+
 def distance_colours(count: int) -> list[Any]:
     """A colour for each of so many curves, no two alike: a few by name, more along a scale."""
     if count <= len(CURVE_COLOURS):
@@ -374,24 +395,30 @@ def _mtf(imaging: optics.Imaging, arguments: dict[str, Any], *, wavelength: floa
 def _finish(axes: Any, *, title: str, label: str, end: float) -> None:
     axes.set(xlim=(0, end), ylim=(0, 1.02), xlabel=label)
     axes.set_title(title, size=LABEL, weight="bold", loc="left", color=INK)
+    quiet(axes)
+
+
+def quiet(axes: Any) -> None:
+    """Axes that stand back behind their curves: a faint grid, two spines, small ticks."""
     axes.grid(color=FAINT, lw=0.8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED)
-    axes.tick_params(labelsize=SMALL, colors=MUTED, length=3)
+    axes.tick_params(labelsize=SMALL, colors=MUTED, length=3, which="both")
     axes.xaxis.label.set(size=SMALL + 0.5, color=MUTED)
 
 
-def _reach(psf: Tensor, *, share: float) -> int:
+def reach_of(psf: Tensor, *, share: float) -> int:
     """Half the width of the square around the origin that holds this share of every PSF's light in its window."""
     height, width = psf.shape[-2:]
     for reach in range(6, min(height, width) // 2):
-        inside = _centre(psf, reach).sum((-2, -1)) / psf.sum((-2, -1)).clamp(min=1e-30)
+        inside = centre(psf, reach).sum((-2, -1)) / psf.sum((-2, -1)).clamp(min=1e-30)
         if bool((inside >= share).all()):
             return reach
     return (min(height, width) - 1) // 2
 
 
-def _centre(psf: Tensor, reach: int) -> Tensor:
+def centre(psf: Tensor, reach: int) -> Tensor:
+    """The square around the origin of PSFs (..., H, W), 2 * reach + 1 pixels wide."""
     row, column = (size // 2 for size in psf.shape[-2:])
     return psf[..., row - reach : row + reach + 1, column - reach : column + reach + 1]
 
@@ -454,11 +481,7 @@ def _draw_tradeoff(axes: Any, rows: Sequence[Row], error: str) -> None:
         if row.seconds is not None and value is not None
     ]
     axes.set(xscale="log", yscale="log", xlabel="CPU seconds of a picture with new optics")
-    axes.grid(color=FAINT, lw=0.7)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(MUTED)
-    axes.tick_params(labelsize=SMALL, colors=MUTED, length=3, which="both")
-    axes.xaxis.label.set(size=SMALL + 0.5, color=MUTED)
+    quiet(axes)
     if not points:
         return
     seen = [value for _, _, value in points if value > 1e-9] or [1.0]

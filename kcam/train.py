@@ -243,7 +243,7 @@ def _stopping() -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: Any) -> None:
         if came:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt("stopped twice")
         came.append(number)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

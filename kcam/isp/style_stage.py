@@ -70,7 +70,8 @@ class StyleStage(Stage):
 
     y = sigmoid( M logit(x) + network(x, noise) )
 
-    Down to a quarter of the size in two strided convolutions, dilated residual blocks, back up by nearest neighbours.
+    Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where what was
+    there on the way down is added: the detail of the picture and of the noise.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
     the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
     Gaussians 6 pixels long and 1 wide, along directions that divide the half circle: from white noise alone a small
@@ -108,6 +109,12 @@ class StyleStage(Stage):
             raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.noise, self.level = width, tuple(dilations), tuple(noise), level
         half, quarter = 2 * width, 4 * width
+        with torch.random.fork_rng(devices=[]):  # torch's layers draw their own start first
+            self._build(width, half, quarter)
+        self._start()
+
+    def _build(self, width: int, half: int, quarter: int) -> None:
+        noise = self.noise
         self.enter, self.enter_norm = _Conv(3 + noise[0] + noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
         self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
@@ -117,7 +124,6 @@ class StyleStage(Stage):
         self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
         self.leave = _Conv(width, 3, 5)
         self.colour = nn.Parameter(torch.eye(3))
-        self._start()
 
     def _start(self) -> None:
         """The same start every time, whatever torch's own generator has given to others."""
@@ -182,14 +188,14 @@ class StyleStage(Stage):
         """The network on a picture whose sides are multiples of 4, with its own statistics or the given ones."""
         how = (None if given is None else iter(given), seen)
         coded = torch.logit(picture.clamp(DARKEST, 1 - DARKEST))
-        x = F.relu(self.enter_norm(self.enter(torch.cat([2 * picture - 1, noise[0]], dim=1)), *how))
-        x = F.relu(self.down1_norm(self.down1(x), *how))
-        x = F.relu(self.down2_norm(self.down2(x), *how))
+        fine = F.relu(self.enter_norm(self.enter(torch.cat([2 * picture - 1, noise[0]], dim=1)), *how))
+        middle = F.relu(self.down1_norm(self.down1(fine), *how))
+        x = F.relu(self.down2_norm(self.down2(middle), *how))
         x = self.mix(torch.cat([x, noise[1]], dim=1))
         for block in self.blocks:
             x = block(x, *how)
-        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
-        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
+        x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how)) + middle
+        x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how)) + fine
         return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:

@@ -310,7 +310,8 @@ class _Run:
         scene = scene.to(device=device)
         if settings.tolerance is not None and self.plan is None:
             self._make_plan()
-        generators = [torch_generator(settings.seed, self.step, stream=NOISE_STREAM + row) for row in rows]
+        streams = [NOISE_STREAM + row for row in rows]
+        generators = [torch_generator(settings.seed, self.step, stream=own, device=device) for own in streams]
         self.clock.mark("scenes")
         terms, picture = self.engine(scene, generators, self.step, self.clock.mark)
         total = torch.stack(list(terms.values())).sum()

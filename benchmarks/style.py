@@ -1,0 +1,229 @@
+"""What each part of a camera brings to a style, and why the thesis's arrangement fails: trained and measured.
+
+    python -m benchmarks.style [--styles strokes,..] [--arms optics,..] [--work .style-bench]     train and measure
+    python -m benchmarks.style --collect                                                        write what is committed
+
+Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting; it is measured on three
+other photographs of 256 pixels, against the ordinary camera's picture and a crop of the painting's right half
+(`style_measures`, which no arm is trained on, and the training loss). Runs are kept in the work folder one by one, so that
+two processes can share them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from benchmarks import style_measures as measures
+from benchmarks.common import ROOT, environment, write_json
+from kcam import isp, optics, plots, sensor
+from kcam.camera import Camera
+from kcam.scene import Scene
+from kcam.style import PRESETS, STYLES, Settings, StyleLoss, fit, painting, style_camera
+from kcam.units import mm, nm, um
+
+WORK = ROOT / ".style-bench"
+RESULT = ROOT / "benchmarks" / "results" / "style.json"
+HALF = 256
+SIZE = 256
+CAMERA_STEPS = 200
+SEED = 5  # of the shots
+
+
+class HardClip(nn.Module):
+    """The thesis's clip: no gradient where it acts."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.clamp(0, 1)
+
+
+def thesis_camera(*, ordinary: bool = False, straight_through: bool = False) -> Camera:
+    """The thesis's network (its figure 4.1) at the size of the quick preset: PSFs of 41 pixels from a phase of 64.
+
+    A flat DOE, a tile of 28 x 28 with signed coefficients, a clip, one 3 x 3 convolution of the mosaic from a random
+    start, a clip. `ordinary` starts the convolution as ours, behind a bilinear demosaic; `straight_through` takes
+    kcam's clip.
+    """
+    lens = optics.Lens(
+        optics.CircularAperture(diameter=5 * mm),
+        optics.PlanoConvexLens(radius_of_curvature=25.8 * mm, glass="N-BK7"),
+        optics.DOE(nn.Parameter(torch.zeros(64, 64)), design_wavelength=550 * nm, glass="fused silica"),
+        focus_distance=2.0,
+    )
+    imaging = optics.Imaging(lens, pixel_pitch=4 * um, propagator="fresnel", psf_shape=(41, 41), bands=12)
+    if ordinary:
+        camera = list(style_camera(stage=False))
+        return Camera(imaging, *camera[1:])
+    learned = sensor.ColourFilter.learned(28)
+    signed = sensor.ColourFilter(nn.Parameter(learned.alpha().detach()), width=learned.width)
+    seeded = torch.Generator().manual_seed(0)
+    weight = nn.Parameter(torch.randn(3, 1, 3, 3, generator=seeded) / 3)
+    clip: Callable[[], nn.Module] = isp.Clip if straight_through else HardClip
+    return Camera(imaging, signed, sensor.Exposure(), clip(), isp.LearnedDemosaic(weight), clip())
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What is trained and how: camera, the loss's arguments, settings. note: for the table."""
+
+    note: str
+    camera: Callable[[], Camera]
+    loss: dict[str, Any]
+    settings: Settings
+    styles: tuple[str, ...] = field(default=tuple(STYLES))
+
+
+QUICK = PRESETS["quick"]
+RATES = QUICK.settings.rates
+CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS)
+THESIS_LOSS = {"statistic": "gram", "style": 30.0, "colour": 0.0, "content": 0.0, "l2": 1.0}
+THESIS = replace(
+    PRESETS["thesis"].settings, steps=2 * CAMERA_STEPS, size=128, rates={"optics": 1e-3, "filter": 1e-3, "demosaic": 1e-3}
+)
+
+
+def only(*parts: str) -> Settings:
+    return replace(CAMERA, rates={part: RATES[part] for part in parts})
+
+
+ARMS: dict[str, Arm] = {
+    "optics": Arm("DOE alone", lambda: style_camera(stage=False), QUICK.loss, only("optics")),
+    "filter": Arm("+ colour filter", lambda: style_camera(stage=False), QUICK.loss, only("optics", "filter")),
+    "convolution": Arm(
+        "+ 3x3 convolution: the thesis's parts",
+        lambda: style_camera(stage=False),
+        QUICK.loss,
+        only("optics", "filter", "demosaic", "tone"),
+    ),
+    "stage": Arm("+ style stage: kcam train", style_camera, QUICK.loss, QUICK.settings),
+    "thesis": Arm("the thesis's arrangement", thesis_camera, THESIS_LOSS, THESIS),
+    "thesis, our start": Arm(
+        "ordinary start, non-negative filter", lambda: thesis_camera(ordinary=True), THESIS_LOSS, THESIS, ("strokes",)
+    ),
+    "thesis, our clip": Arm(
+        "straight-through clip", lambda: thesis_camera(straight_through=True), THESIS_LOSS, THESIS, ("strokes",)
+    ),
+    "thesis, our content": Arm(
+        "correlation in place of L2", thesis_camera, THESIS_LOSS | {"l2": 0.0, "content": 0.6}, THESIS, ("strokes",)
+    ),
+    "thesis, our style loss": Arm(
+        "relative moments and colours in place of Gram",
+        thesis_camera,
+        {"l2": 1.0, "content": 0.0, "colour": 1.0},
+        THESIS,
+        ("strokes",),
+    ),
+    "thesis, our rates": Arm(
+        "a rate per part, warm-up, cosine, averaging",
+        thesis_camera,
+        THESIS_LOSS,
+        replace(CAMERA, steps=2 * CAMERA_STEPS, rates={k: RATES[k] for k in ("optics", "filter", "demosaic")}),
+        ("strokes",),
+    ),
+}
+
+
+def halves(style: str) -> tuple[Tensor, Tensor]:
+    """What is trained on, and the other crop of the style, 256 x 256 each."""
+    whole = painting(style, size=2 * HALF)
+    return whole[:, :, :HALF], whole[:, :HALF, HALF:]
+
+
+def shots(camera: Camera) -> dict[str, Tensor]:
+    """The photographs that no camera is trained on, taken by it."""
+    with torch.no_grad():
+        return {
+            name: camera(Scene.from_rgb(photo), generator=torch.Generator().manual_seed(SEED))[0].clamp(0, 1)
+            for name, photo in measures.photographs(SIZE).items()
+        }
+
+
+def gaps(pictures: dict[str, Tensor], *, style: str) -> dict[str, Any]:
+    """All measures of an arm's pictures: for each photograph, their means, and the wallpaper of all."""
+    own, other = halves(style)
+    loss = StyleLoss(own, content=0.0, colour=QUICK.loss.get("colour", 0.5))
+    ordinary = shots(style_camera(stage=False))
+    photographs = measures.photographs(SIZE)
+    rows = {}
+    with torch.no_grad():
+        least = float(loss(other[None]))
+        for name, picture in pictures.items():
+            row = measures.measure(
+                picture, scene=photographs[name], ordinary=ordinary[name], style=own, other_style=other
+            )
+            most = float(loss(ordinary[name][None]))
+            row["training_loss"] = measures.gap_closed(float(loss(picture[None])), ordinary=most, other=least)
+            rows[name] = row
+    keys = next(iter(rows.values()))
+    mean = {key: sum(row[key] for row in rows.values()) / len(rows) for key in keys}
+    return {"photographs": rows, "mean": mean, "wallpaper": measures.wallpaper(list(pictures.values()))}
+
+
+def run(style: str, name: str, work: Path) -> dict[str, Any]:
+    """Train an arm, write its camera and pictures, and measure."""
+    arm = ARMS[name]
+    own, _ = halves(style)
+    camera = arm.camera()
+    loss = StyleLoss(own, crop=arm.settings.size, **arm.loss)
+    began = time.perf_counter()
+    import warnings
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        trained = fit(camera, loss, settings=arm.settings)
+    seconds = time.perf_counter() - began
+    pictures = shots(camera)
+    folder = work / f"{style}-{name}".replace(", ", "-").replace(" ", "-")
+    folder.mkdir(parents=True, exist_ok=True)
+    for title, picture in pictures.items():
+        plots.write_picture(picture, folder / f"{title}.png")
+    row = {
+        "style": style,
+        "arm": name,
+        "note": arm.note,
+        "steps": arm.settings.steps,
+        "seconds": seconds,
+        "threads": torch.get_num_threads(),
+        "loss_at_end": float(trained.history[-20:, 0].mean()),
+        "warnings": [str(w.message) for w in caught],
+    } | gaps(pictures, style=style)
+    (folder / "result.json").write_text(json.dumps(row))
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--styles", default=",".join(STYLES))
+    parser.add_argument("--arms", default=";".join(ARMS), help="separated by semicolons")
+    parser.add_argument("--work", type=Path, default=WORK)
+    parser.add_argument("--collect", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.collect:
+        collect(arguments.work)
+        return
+    for style in arguments.styles.split(","):
+        for name in arguments.arms.split(";"):
+            if style in ARMS[name].styles:
+                row = run(style, name, arguments.work)
+                print(style, name, f"{row['seconds']:.0f} s", {k: round(v, 2) for k, v in row["mean"].items()}, flush=True)
+
+
+def collect(work: Path) -> None:
+    """Runs in the work folder to the committed results and pictures."""
+    rows = [json.loads(path.read_text()) for path in sorted(work.glob("*/result.json"))]
+    order = {name: index for index, name in enumerate(ARMS)}
+    rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]]))
+    write_json(RESULT, {"environment": environment(), "rows": rows})
+    print(RESULT)
+
+
+if __name__ == "__main__":
+    main()
