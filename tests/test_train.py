@@ -20,6 +20,10 @@ from kcam.style import painting
 SMALL = {"steps": 3, "size": 64, "batch": 1}
 
 
+def invoke(command: str):
+    return CliRunner().invoke(app, command.split())
+
+
 def run(out: Path, *, resume: bool = False, threads: int | None = 1, advance=None, **changes):
     lines: list[str] = []
     chosen = {"style": "strokes", "out": str(out), "stage": False} | SMALL | changes
@@ -139,21 +143,21 @@ def test_threads_are_put_back(tmp_path: Path) -> None:
 def test_train_shoot_and_paint_as_commands(tmp_path: Path, trained: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     command = "train strokes --steps 1 --size 64 --batch 1 --no-stage --threads 1 --profile --out a.safetensors"
-    result = CliRunner().invoke(app, command.split())
+    result = invoke(command)
     assert result.exit_code == 0, result.output
     assert "a.safetensors\na/report.html" in result.output
     assert "s a step" in result.output
     plots.write_picture(Scene.builtin("chelsea", 96).to_srgb()[0], "photo.png")
-    result = CliRunner().invoke(app, f"shoot photo.png --camera {trained} --out shot.png --seed 3".split())
+    result = invoke(f"shoot photo.png --camera {trained} --out shot.png --seed 3")
     assert result.exit_code == 0, result.output
     assert Path("shot.png").exists()
-    result = CliRunner().invoke(app, ["paint", "photo.png", "--style", "woodcut", "--steps", "2", "--size", "64", "--out", "painted.png"])
+    result = invoke("paint photo.png --style woodcut --steps 2 --size 64 --out painted.png")
     assert result.exit_code == 0, result.output
-    result = CliRunner().invoke(app, ["paint", "--style", "woodcut", "--steps", "2", "--size", "64", "--out", "texture.png"])
+    result = invoke("paint --style woodcut --steps 2 --size 64 --out texture.png")
     assert result.exit_code == 0, result.output
     assert Scene.from_file("texture.png").shape == (1, 64, 64)
     assert Scene.from_file("painted.png").shape[2] == 64
-    result = CliRunner().invoke(app, ["paint", "--style", "nothing", "--out", "texture.png"])
+    result = invoke("paint --style nothing --out texture.png")
     assert result.exit_code == 2
     assert 'unknown style "nothing"' in " ".join(result.output.split())
 

@@ -167,10 +167,11 @@ class StyleLoss(nn.Module):
         levels: of the correlation.
         content_layer: of the features, where content_by is "features".
         crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
-    Raises:    ValueError for an unknown name, a negative weight, or a style that is too small; TypeError for what is no
-               picture.
+    Raises:    ValueError for an unknown name, weights that are negative or all 0, or a style that is too small;
+               TypeError for what is no picture.
     """
 
+    features: Any
     quantiles: Tensor
     deviation: Tensor
 
@@ -198,14 +199,19 @@ class StyleLoss(nn.Module):
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
                 raise ValueError(f"the weight of {name} must be a finite number >= 0, got {weight!r}.")
-        self.features = features = SteerableFeatures() if features is None else features
-        sizes: dict[str, Any] = {"multiple": features.multiple, "least": features.least}
+        if not any(self.weights.values()):
+            raise ValueError("all weights are 0: no term is left. Give one, such as style=1.")
+        if not levels or min(levels) < 1:
+            raise ValueError(f"levels must be whole numbers of at least 1, got {levels!r}. Use levels=(1, 2, 4).")
+        self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
         self.levels, self.content_layer = tuple(levels), content_layer
-        crops = style_crops(picture, side=crop, **sizes)
+        crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
         self.crop = crops.shape[-1]
         with torch.no_grad():
             self._remember(crops)
+        if content_by == "features" and content_layer not in self.targets:
+            raise ValueError(f"unknown content_layer {content_layer!r}; known: {', '.join(self.targets)}.")
 
     def _remember(self, crops: Tensor) -> None:
         """The style's own side of each term: pooled over its crops."""
@@ -248,7 +254,8 @@ class StyleLoss(nn.Module):
         """
         weights = self.weights
         terms: dict[str, Tensor] = {}
-        layers = self.features(picture) if weights["style"] or self.content_by == "features" else {}
+        of_features = weights["style"] or (weights["content"] and self.content_by == "features")
+        layers = self.features(picture) if of_features else {}
         if weights["style"]:
             terms["style"] = weights["style"] * self._style(layers)
         if weights["colour"]:
@@ -306,6 +313,8 @@ def style_crops(picture: Tensor, *, side: int | None, multiple: int, least: int,
     low, high = (value.item() for value in picture.detach().aminmax())
     if not (low >= 0 and high <= 1):
         raise ValueError(f"a style has values in [0,1], got {low:g} to {high:g}. Use picture.clamp(0, 1), or / 255.")
+    if side is not None and side < least:
+        raise ValueError(f"crops of {side} pixels are too small: the features need at least {least}. Use crop={least}.")
     shorter = min(picture.shape[-2:])
     side = min(side or 128, shorter) // multiple * multiple
     if side < least:
