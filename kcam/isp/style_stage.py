@@ -74,8 +74,8 @@ class StyleStage(Stage):
     convolution also sees what the first one made: the detail of the picture and of the noise.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
     the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
-    Gaussians 6 pixels long and 1 wide, along directions that divide the half circle: from white noise alone a small
-    network learns grain before it learns strokes. As it is built it changes
+    Gaussians 6 pixels long and 1 wide and twice as large ones, along directions that divide the half circle: from white
+    noise alone a small network learns grain before it learns strokes. As it is built it changes
     nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
     The noise comes from the context's generator: the same generator state, picture and weights give the same bytes. A
@@ -84,8 +84,8 @@ class StyleStage(Stage):
 
     Args:      width: channels at full size; twice and four times as many at half and a quarter.
                dilations: of the residual blocks.
-               noise: planes of white noise at full size, of noise drawn out along as many directions, and of white
-               noise at a quarter of the size.
+               noise: planes of white noise at full size, directions of drawn-out noise, which has two planes for each,
+               and planes of white noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
     Raises:    ValueError for a width, a dilation or a number of planes that is not positive, a negative level, and at
                the call for another number of channels than 3.
@@ -97,8 +97,8 @@ class StyleStage(Stage):
         self,
         *,
         width: int = 16,
-        dilations: Sequence[int] = (1, 2, 4, 1),
-        noise: tuple[int, int, int] = (1, 4, 4),
+        dilations: Sequence[int] = (1, 2, 4, 8),
+        noise: tuple[int, int, int] = (3, 4, 8),
         level: float = 1.0,
     ) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class StyleStage(Stage):
 
     def _build(self, width: int, half: int, quarter: int) -> None:
         noise = self.noise
-        self.enter, self.enter_norm = _Conv(3 + noise[0] + noise[1], width, 5), _Norm(width)
+        self.enter, self.enter_norm = _Conv(3 + noise[0] + 2 * noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
         self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
         self.mix = _Conv(quarter + noise[2], quarter, 1)
@@ -168,19 +168,23 @@ class StyleStage(Stage):
         where: dict[str, Any] = {"dtype": picture.dtype, "device": picture.device}
         white, drawn_out, at_quarter = self.noise
         if self.level == 0:
-            fine = picture.new_zeros(batch, white + drawn_out, height, width)
+            fine = picture.new_zeros(batch, white + 2 * drawn_out, height, width)
             return fine, picture.new_zeros(batch, at_quarter, height // 4, width // 4)
         if generator is not None and generator.device != picture.device:
             where["device"] = generator.device
-        around = 2 * LONGEST
-        shapes = ((white, height, width), (drawn_out, height + around, width + around))
-        fine, strokes, coarse = (
-            torch.randn(batch, *shape, generator=generator, **where).to(picture.device)
-            for shape in (*shapes, (at_quarter, height // 4, width // 4))
+        shapes = (
+            (white, height, width),
+            (at_quarter, height // 4, width // 4),
+            (drawn_out, height + 2 * LONGEST, width + 2 * LONGEST),
+            (drawn_out, height // 2 + 2 * LONGEST, width // 2 + 2 * LONGEST),
+        )
+        fine, coarse, thin, wide = (
+            torch.randn(batch, *shape, generator=generator, **where).to(picture.device) for shape in shapes
         )
         if drawn_out:
-            strokes = F.conv2d(strokes, stroke_kernels(drawn_out).to(picture), groups=drawn_out)
-            fine = torch.cat([fine, strokes], dim=1)
+            kernels = stroke_kernels(drawn_out).to(picture)
+            thin, wide = (F.conv2d(strokes, kernels, groups=drawn_out) for strokes in (thin, wide))
+            fine = torch.cat([fine, thin, _doubled(wide)], dim=1)
         return self.level * fine, self.level * coarse
 
     def _paint(

@@ -164,7 +164,7 @@ class StyleLoss(nn.Module):
         statistic: "moments" (`moment_loss`) or "gram" (eq. 3.12), the mean and the sum over the layers.
         content_by: "correlation" (`correlation_loss`), or "features": eq. 3.10 at the layer `content_layer`.
         style, colour, content, l2, tv: weights; a term of weight 0 is not computed.
-        levels: of the correlation.
+        levels, window: of the correlation.
         content_layer: of the features, where content_by is "features".
         crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
     Raises:    ValueError for an unknown name, weights that are negative or all 0, or a style that is too small;
@@ -188,6 +188,7 @@ class StyleLoss(nn.Module):
         l2: float = 0.0,
         tv: float = 0.0,
         levels: tuple[int, ...] = (1, 2, 4),
+        window: int = 11,
         content_layer: str = "relu3_3",
         crop: int | None = None,
     ) -> None:
@@ -203,9 +204,11 @@ class StyleLoss(nn.Module):
             raise ValueError("all weights are 0: no term is left. Give one, such as style=1.")
         if not levels or min(levels) < 1:
             raise ValueError(f"levels must be whole numbers of at least 1, got {levels!r}. Use levels=(1, 2, 4).")
+        if window < 2:
+            raise ValueError(f"window must be at least 2 pixels, got {window!r}. Use window=11.")
         self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
-        self.levels, self.content_layer = tuple(levels), content_layer
+        self.levels, self.window, self.content_layer = tuple(levels), window, content_layer
         crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
         self.crop = crops.shape[-1]
         with torch.no_grad():
@@ -294,7 +297,7 @@ class StyleLoss(nn.Module):
 
     def _content(self, picture: Tensor, scene: Tensor, layers: dict[str, Tensor]) -> Tensor:
         if self.content_by == "correlation":
-            return correlation_loss(picture, scene, levels=self.levels)
+            return correlation_loss(picture, scene, levels=self.levels, window=self.window)
         with torch.no_grad():
             target = self.features(scene)[self.content_layer]
         return content_loss(layers[self.content_layer], target)

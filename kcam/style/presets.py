@@ -96,17 +96,20 @@ class Preset:
         return replace(settings, **changes)
 
 
+PAINTED: dict[str, Any] = {"colour": 0.7, "content": 0.4, "levels": (2, 4), "window": 15}
+"""Contents are measured from half the size on, which leaves room for strokes."""
+
 PRESETS: dict[str, Preset] = {
     "quick": Preset(
         "built-in scenes, 128 pixels: minutes on a laptop",
         style_camera,
-        {"content": 0.3, "levels": (2, 4, 8)},
+        PAINTED,
         Settings(steps=600),
     ),
     "standard": Preset(
         "256 pixels, more steps: half an hour on a CPU, a minute on a GPU",
         style_camera,
-        {"content": 0.3, "levels": (2, 4, 8)},
+        PAINTED,
         Settings(steps=1000, size=256),
     ),
     "thesis": Preset(

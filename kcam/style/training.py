@@ -70,7 +70,7 @@ class Settings:
     size: int = 128
     seed: int = 0
     rates: dict[str, float] = field(
-        default_factory=lambda: {"optics": 0.01, "filter": 0.05, "demosaic": 0.01, "tone": 0.01, "stage": 3e-3}
+        default_factory=lambda: {"optics": 0.01, "filter": 0.05, "demosaic": 0.01, "tone": 0.01, "stage": 1e-2}
     )
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.0
