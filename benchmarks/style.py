@@ -2,6 +2,7 @@
 
     python -m benchmarks.style [--styles strokes,..] [--arms optics,..] [--work .style-bench]     train and measure
     python -m benchmarks.style --collect                                                        write what is committed
+    python -m benchmarks.style --paint                                                          docs/painted.jpg
 
 Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting; it is measured on three
 other photographs of 256 pixels, against the ordinary camera's picture and a crop of the painting's right half
@@ -12,6 +13,7 @@ that two processes can share them.
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import time
 import warnings
@@ -21,14 +23,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from PIL import Image
 from torch import Tensor, nn
 
 from benchmarks import style_measures as measures
 from benchmarks.common import ROOT, environment, write_json
 from kcam import isp, optics, plots, sensor
 from kcam.camera import Camera
-from kcam.scene import Scene
-from kcam.style import PRESETS, STYLES, Settings, StyleLoss, fit, painting, style_camera
+from kcam.scene import Scene, read_picture
+from kcam.style import PRESETS, STYLES, Settings, StyleLoss, fit, paint, painting, style_camera
 from kcam.units import mm, nm, um
 
 WORK = ROOT / ".style-bench"
@@ -183,7 +186,7 @@ def run(style: str, name: str, work: Path) -> dict[str, Any]:
         trained = fit(camera, loss, settings=arm.settings)
     seconds = time.perf_counter() - began
     pictures = shots(camera)
-    folder = work / f"{style}-{name}".replace(", ", "-").replace(" ", "-")
+    folder = folder_of(style, name, work)
     folder.mkdir(parents=True, exist_ok=True)
     for title, picture in pictures.items():
         plots.write_picture(picture, folder / f"{title}.png")
@@ -207,9 +210,13 @@ def main() -> None:
     parser.add_argument("--arms", default=";".join(ARMS), help="separated by semicolons")
     parser.add_argument("--work", type=Path, default=WORK)
     parser.add_argument("--collect", action="store_true")
+    parser.add_argument("--paint", action="store_true")
     arguments = parser.parse_args()
     if arguments.collect:
         collect(arguments.work)
+        return
+    if arguments.paint:
+        paint_pictures()
         return
     for style in arguments.styles.split(","):
         for name in arguments.arms.split(";"):
@@ -219,13 +226,78 @@ def main() -> None:
                 print(style, name, f"{row['seconds']:.0f} s", mean, flush=True)
 
 
+def folder_of(style: str, name: str, work: Path) -> Path:
+    return work / f"{style}-{name}".replace(", ", "-").replace(" ", "-")
+
+
 def collect(work: Path) -> None:
     """Runs in the work folder to the committed results and pictures."""
     rows = [json.loads(path.read_text()) for path in sorted(work.glob("*/result.json"))]
     order = {name: index for index, name in enumerate(ARMS)}
     rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]]))
     write_json(RESULT, {"environment": environment(), "rows": rows})
-    print(RESULT)
+
+    def shot(style: str, name: str, photograph: str) -> Tensor:
+        return read_picture(folder_of(style, name, work) / f"{photograph}.png")
+
+    photographs = measures.photographs(SIZE)
+    ordinary = shots(style_camera(stage=False))
+    hopper = next(iter(photographs))
+    sheets = {
+        "style": plots.contact_sheet(
+            [[halves(style)[0], *(shot(style, "stage", name) for name in photographs)] for style in STYLES],
+            titles=["Style", *(f"A shot: {name}" for name in photographs)],
+            labels=[f"kcam train {style}" for style in STYLES],
+        ),
+        "style-parts": plots.contact_sheet(
+            [
+                [ordinary[hopper], *(shot(style, name, hopper) for name in ("optics", "filter", "convolution", "stage"))]
+                for style in STYLES
+            ],
+            titles=["Ordinary camera", "DOE alone", "+ colour filter", "+ 3x3 and tone", "+ style stage"],
+            labels=list(STYLES),
+        ),
+        "style-thesis": plots.contact_sheet(
+            [
+                [photographs[name], *(shot("strokes", arm, name) for arm in ARMS if arm.startswith("thesis"))]
+                for name in photographs
+            ],
+            titles=["Photograph", *(arm.replace("thesis, ", "+ ") for arm in ARMS if arm.startswith("thesis"))],
+            labels=["The thesis's arrangement", "", ""],
+        ),
+    }
+    for name, figure in sheets.items():
+        save_jpeg(figure, ROOT / "docs" / f"{name}.jpg")
+    print(RESULT, *sheets)
+
+
+def paint_pictures() -> None:
+    """What `kcam paint` makes: textures of the styles from white noise, and paintings from a photograph."""
+    photograph = measures.photographs(SIZE)["hopper"]
+    rows = []
+    for style in STYLES:
+        own, _ = halves(style)
+        texture = paint(StyleLoss(own, content=0.0, colour=1.0), shape=(SIZE, SIZE), steps=200)
+        painted = paint(StyleLoss(own, content=0.3, colour=1.0), photo=photograph, steps=200)
+        from_noise = paint(StyleLoss(own, content=0.3, colour=1.0), photo=photograph, start="noise", steps=200)
+        rows.append([own, texture, painted, from_noise])
+    sheet = plots.contact_sheet(
+        rows,
+        titles=["Style", "Texture, from white noise", "Painting, from the photo", "Painting, from white noise"],
+        labels=list(STYLES),
+    )
+    save_jpeg(sheet, ROOT / "docs" / "painted.jpg")
+
+
+def save_jpeg(figure: Any, path: Path, *, largest: int = 600_000) -> None:
+    """As docs/generate.py does, which cannot be imported before it has read the results."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=130, facecolor="white", format="png")
+    picture = Image.open(content).convert("RGB")
+    for quality in (90, 84, 78, 70):
+        picture.save(path, quality=quality, subsampling=0, optimize=True)
+        if path.stat().st_size < largest:
+            return
 
 
 if __name__ == "__main__":

@@ -45,6 +45,8 @@ from kcam.tradeoff import Row, Sweep  # noqa: E402
 from kcam.units import mm, nm, um  # noqa: E402
 
 README = ROOT / "README.md"
+PAGES = ("docs/style.md",)
+"""Beside the README: their tables are made anew, their code is not run."""
 RESULTS = ROOT / "benchmarks" / "results"
 
 # ---- the propagators -------------------------------------------------------------------------------------------------
@@ -604,7 +606,48 @@ def contact_sheet(path: Path) -> None:
         picture.save(path, quality=88, optimize=True)
 
 
+# ---- styles ----------------------------------------------------------------------------------------------------------
+
+STYLE_MEASURES = {
+    "training_loss": "training loss",
+    "patch_swd": "patch SWD",
+    "oriented_texture": "oriented texture",
+    "luminance_correlation": "luminance",
+    "detail_correlation": "detail",
+}
+
+
+def style_rows(name: str) -> list[dict[str, Any]]:
+    rows = json.loads((RESULTS / "style.json").read_text())["rows"]
+    return [row for row in rows if row["arm"].startswith("thesis") == (name == "thesis")]
+
+
+def style_line(row: dict[str, Any]) -> str:
+    mean = row["mean"]
+    gaps = (f"{100 * mean[key]:.0f} %" for key in list(STYLE_MEASURES)[:3])
+    correlations = (f"{mean[key]:.2f}" for key in list(STYLE_MEASURES)[3:])
+    return " | ".join((*gaps, *correlations, f"{row['wallpaper']:.2f}", f"{row['seconds']:.0f} s"))
+
+
+def style_table() -> str:
+    """What each part of the camera brings, for each style."""
+    head = f"| style | what trains | {' | '.join(STYLE_MEASURES.values())} | wallpaper | time |"
+    lines = [head, "|---" * 9 + "|"]
+    lines += [f"| {row['style']} | {row['note']} | {style_line(row)} |" for row in style_rows("ours")]
+    return "\n".join(lines)
+
+
+def thesis_table() -> str:
+    """The thesis's arrangement, and what each of our changes repairs."""
+    head = f"| arrangement | style | {' | '.join(STYLE_MEASURES.values())} | wallpaper | time |"
+    lines = [head, "|---" * 9 + "|"]
+    lines += [f"| {row['note']} | {row['style']} | {style_line(row)} |" for row in style_rows("thesis")]
+    return "\n".join(lines)
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "style": style_table,
+    "thesis": thesis_table,
     "propagators": propagators_table,
     "tradeoff": tradeoff_table,
     "traps": traps_table,
@@ -791,10 +834,13 @@ def main(arguments: list[str] | None = None) -> int:
     before = README.read_text()
     with tempfile.TemporaryDirectory() as folder, inside(folder):
         after = with_output(with_tables(before))
+    pages = {ROOT / page: with_tables((ROOT / page).read_text()) for page in PAGES} | {README: after}
     if options.check:
-        sys.stdout.write("in step\n" if after == before else "out of step: run python docs/generate.py\n")
-        return int(after != before)
-    README.write_text(after)
+        same = all(path.read_text() == text for path, text in pages.items())
+        sys.stdout.write("in step\n" if same else "out of step: run python docs/generate.py\n")
+        return int(not same)
+    for path, text in pages.items():
+        path.write_text(text)
     return 0
 
 
