@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.precision import full_precision
 
 SEEN_AT_ONCE = 2**20
 """Pixels; a larger picture is painted in tiles."""
@@ -32,6 +33,9 @@ class _Conv(nn.Conv2d):
         super().__init__(
             channels, out, side, stride=stride, dilation=dilation, padding=border, padding_mode="replicate"
         )
+
+    def reset_parameters(self) -> None:
+        """Nothing: torch's would draw from the global generator, and the stage sets them."""
 
 
 class _Norm(nn.Module):
@@ -70,7 +74,7 @@ class StyleStage(Stage):
 
     y = sigmoid( M logit(x) + network(x, noise) )
 
-    Down to a quarter of the size in two strided convolutions, dilated residual blocks, back up by nearest neighbours.
+    Down to a quarter of the size in two strided convolutions, dilated residual blocks, back up bilinearly.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
     the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
     Gaussians 6 pixels long and 1 wide, along directions that divide the half circle: from white noise alone a small
@@ -83,11 +87,11 @@ class StyleStage(Stage):
 
     Args:      width: channels at full size; twice and four times as many at half and a quarter.
                dilations: of the residual blocks.
-               noise: planes of white noise at full size, of noise drawn out along as many directions, and of white noise
-               at a quarter of the size.
+               noise: planes of white noise at full size, of noise drawn out along as many directions, and of white
+               noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
-    Raises:    ValueError for a width, a dilation or a number of planes that is not positive, a negative level, and at
-               the call for another number of channels than 3.
+    Raises:    ValueError for a width or a dilation below 1, anything but three numbers of planes >= 0, a level that is
+               negative or not finite, and at the call for another number of channels than 3.
     Source:    Johnson, Alahi and Fei-Fei, Perceptual losses for real-time style transfer and super-resolution (2016);
                Ulyanov et al., Texture networks (2016), the noise; instance normalisation (2016).
     """
@@ -101,12 +105,15 @@ class StyleStage(Stage):
         level: float = 1.0,
     ) -> None:
         super().__init__()
-        for name, values in (("width", (width,)), ("dilations", tuple(dilations)), ("noise", tuple(noise))):
-            if not values or not all(isinstance(value, int) and value >= (name != "noise") for value in values):
+        for name, values in (("width", (width,)), ("dilations", tuple(dilations))):
+            if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
-        if not level >= 0:
-            raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
-        self.width, self.dilations, self.noise, self.level = width, tuple(dilations), tuple(noise), level
+        noise = tuple(noise)
+        if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
+            raise ValueError(f"noise must be three whole numbers >= 0, such as (1, 4, 4), got {noise!r}.")
+        if not 0 <= level < math.inf:
+            raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
+        self.width, self.dilations, self.noise, self.level = width, tuple(dilations), noise, level
         half, quarter = 2 * width, 4 * width
         self.enter, self.enter_norm = _Conv(3 + noise[0] + noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
@@ -124,7 +131,10 @@ class StyleStage(Stage):
         seeded = torch.Generator("cpu").manual_seed(0)
         for layer in self.modules():
             if isinstance(layer, _Conv):
-                nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=seeded)
+                start = torch.empty(layer.weight.shape, dtype=layer.weight.dtype, device="cpu")
+                nn.init.kaiming_uniform_(start, a=math.sqrt(5), generator=seeded)
+                with torch.no_grad():
+                    layer.weight.copy_(start)
                 nn.init.zeros_(layer.bias)
         nn.init.zeros_(self.leave.weight)
 
@@ -150,10 +160,10 @@ class StyleStage(Stage):
         if signal.numel() == 0:
             return signal
         height, width = signal.shape[-2:]
-        whole = F.pad(signal, (0, -width % 4, 0, -height % 4), mode="replicate")
+        whole = F.pad(signal.to(self.colour.dtype), (0, -width % 4, 0, -height % 4), mode="replicate")
         noise = self._noise(whole, (context or Context()).generator)
         painted = self._paint(whole, noise) if height * width <= SEEN_AT_ONCE else self._in_tiles(whole, noise)
-        return painted[..., :height, :width]
+        return painted[..., :height, :width].to(signal.dtype)
 
     def _noise(self, picture: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Planes at full size and at a quarter, for the whole picture."""
@@ -190,7 +200,9 @@ class StyleStage(Stage):
             x = block(x, *how)
         x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
         x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
-        return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + self.leave(x))
+        strokes = self.leave(x).to(coded)
+        with full_precision(coded.device):  # autocast may round what is painted, not what is kept
+            return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + strokes)
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
         """A large picture, tile by tile with a border as wide as the reach: bounded memory, no seams."""
@@ -213,7 +225,7 @@ class StyleStage(Stage):
 
 
 def stroke_kernels(count: int) -> Tensor:
-    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25): of white noise they make unit noise."""
+    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25), that keep the variance of noise."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
     angle = torch.arange(count, dtype=torch.float64)[:, None, None] * (math.pi / count)
