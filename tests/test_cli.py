@@ -162,7 +162,6 @@ def test_shoot_bad_input(photo: Path, tmp_path: Path) -> None:
     folder.mkdir()
     assert "there is no picture in the folder" in fails("shoot", folder, "--out", out)
     assert "is a folder. Name the file in it" in fails("shoot", photo, "--camera", tmp_path, "--out", out)
-    assert "there is a folder of that name" in fails("shoot", photo, "--out", folder)
     for seed in (10**22, -1):
         assert "Invalid value for '--seed'" in run("shoot", photo, "--out", out, "--seed", seed, status=2)
     assert not out.exists()
