@@ -28,6 +28,8 @@ DARKEST = 0.03
 class _Conv(nn.Conv2d):
     """A convolution that continues the picture by its border."""
 
+    bias: nn.Parameter
+
     def __init__(self, channels: int, out: int, side: int, *, stride: int = 1, dilation: int = 1) -> None:
         border = dilation * (side // 2)
         super().__init__(
@@ -108,12 +110,12 @@ class StyleStage(Stage):
         for name, values in (("width", (width,)), ("dilations", tuple(dilations))):
             if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
-        noise = tuple(noise)
         if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
             raise ValueError(f"noise must be three whole numbers >= 0, such as (1, 4, 4), got {noise!r}.")
         if not 0 <= level < math.inf:
             raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
-        self.width, self.dilations, self.noise, self.level = width, tuple(dilations), noise, level
+        self.width, self.dilations, self.level = width, tuple(dilations), level
+        self.noise = (noise[0], noise[1], noise[2])
         half, quarter = 2 * width, 4 * width
         self.enter, self.enter_norm = _Conv(3 + noise[0] + noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
@@ -135,7 +137,7 @@ class StyleStage(Stage):
                 nn.init.kaiming_uniform_(start, a=math.sqrt(5), generator=seeded)
                 with torch.no_grad():
                     layer.weight.copy_(start)
-                nn.init.zeros_(layer.bias)
+                    layer.bias.zero_()
         nn.init.zeros_(self.leave.weight)
 
     @property
