@@ -303,7 +303,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the largest memory is in kilobytes there")
 def test_twelve_megapixels_in_bounded_memory(tmp_path: Path) -> None:
-    """Measured 2.56 GB: 0.4 for Python and torch, 1.5 for the picture at the demosaic, the rest for noise and tiles."""
+    """Measured 2.0 GB, at the convolution behind the demosaic: 0.4 for Python and torch, eleven planes of 0.14 GB."""
     camera, photo, out = tmp_path / "camera.safetensors", tmp_path / "photo.jpg", tmp_path / "shot.png"
     Camera(*style_camera(stage=False), painting_stage()).save(camera)
     make_photo(photo, width=4000, height=3000)
@@ -316,7 +316,7 @@ def test_twelve_megapixels_in_bounded_memory(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     with Image.open(out) as picture:
         assert picture.size == (4000, 3000)
-    assert int(done.stdout) * 1024 < 3.2e9
+    assert int(done.stdout) * 1024 < 2.5e9  # a quarter more, for other allocators
 
 
 def test_suffixes_that_are_read_in_a_folder_can_be_written() -> None:
