@@ -85,6 +85,7 @@ class Arm:
     styles: tuple[str, ...] = field(default=tuple(STYLES))
 
 
+OURS = ("optics", "filter", "convolution", "stage")
 QUICK = PRESETS["quick"]
 RATES = QUICK.settings.rates
 CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS)
@@ -251,7 +252,7 @@ def collect(work: Path) -> None:
         ),
         "style-parts": plots.contact_sheet(
             [
-                [ordinary[hopper], *(shot(style, name, hopper) for name in ("optics", "filter", "convolution", "stage"))]
+                [ordinary[hopper], *(shot(style, part, hopper) for part in OURS)]
                 for style in STYLES
             ],
             titles=["Ordinary camera", "DOE alone", "+ colour filter", "+ 3x3 and tone", "+ style stage"],

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -176,18 +176,21 @@ def shoot(
         from kcam import shoot as module
 
         stages = open_camera(camera)
+        how: dict[str, Any] = {
+            "distance": length(distance),
+            "seed": seed,
+            "size": size or None,
+            "tolerance": as_tolerance(tolerance) if tolerance else None,
+        }
         pairs = module.outputs(photos, out)
         with progress("shoot", total=len(pairs)) as advance:
             for photo, target in pairs:
-                module.shoot(
-                    stages,
-                    photo,
-                    target,
-                    distance=length(distance),
-                    seed=seed,
-                    size=size or None,
-                    tolerance=as_tolerance(tolerance) if tolerance else None,
-                )
+                try:
+                    module.shoot(stages, photo, target, **how)
+                except (ValueError, OSError) as error:
+                    if len(pairs) == 1 or photo.name in str(error):
+                        raise
+                    raise ValueError(f"{photo.name}: {error}") from error
                 advance(photo.name)
                 typer.echo(target)
 

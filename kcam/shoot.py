@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,10 +27,10 @@ def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     known = plots.PICTURE_SUFFIXES
     found: list[Path] = []
     for photo in photos:
-        inside = sorted(p for p in photo.iterdir() if p.suffix.lower() in known) if photo.is_dir() else []
-        if photo.is_dir() and not inside:
+        inside = _pictures(photo) if photo.is_dir() else [photo]
+        if not inside:
             raise ValueError(f"there is no picture in the folder {photo}: expected {', '.join(known)}.")
-        found += inside or [photo]
+        found += inside
     single = len(found) == 1 and not photos[0].is_dir() and not out.is_dir() and out.suffix != ""
     if single:
         plots.check_writable(out)
@@ -42,15 +43,23 @@ def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
         if not out.absolute().parent.is_dir():
             raise FileNotFoundError(f"there is no folder {out.parent} to make {out.name} in.")
         pairs = [(photo, out / f"{photo.stem}.png") for photo in found]
-        twice = [t.name for i, (_, t) in enumerate(pairs) if t in [other for _, other in pairs[:i]]]
-        if twice:
-            raise ValueError(f"two of the photos would both become {twice[0]}. Take them into different folders.")
+        name, times = Counter(target.name for _, target in pairs).most_common(1)[0]
+        if times > 1:
+            raise ValueError(f"two of the photos would both become {name}. Take them into different folders.")
+        for _, target in pairs if out.is_dir() else ():
+            plots.check_writable(target)
     for photo, target in pairs:
         if not photo.is_file():
             raise FileNotFoundError(f"there is no file {photo}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
         if target.exists() and target.samefile(photo):
             raise ValueError(f"{target} is the photo itself, which would be lost. Choose another name for --out.")
     return pairs
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """Those in a folder, by name; not what is hidden: some systems keep a file of notes beside each, ._photo.jpg."""
+    names = (path for path in folder.iterdir() if path.suffix.lower() in plots.PICTURE_SUFFIXES)
+    return sorted(path for path in names if path.is_file() and not path.name.startswith("."))
 
 
 def shoot(

@@ -24,9 +24,9 @@ def convolve_planes(signal: Tensor, *, weight: Tensor, bias: Tensor) -> Tensor:
             f"a kernel of shape {tuple(weight.shape)} takes {channels} planes (..., {channels}, H, W), got shape "
             f"{tuple(signal.shape)}. Put it behind a Demosaic."
         )
-    planes = signal.reshape(-1, *signal.shape[-3:])
     if signal.numel() == 0:
         return signal.new_zeros(*signal.shape[:-3], len(weight), *signal.shape[-2:])
+    planes = signal.reshape(-1, *signal.shape[-3:])
     border = weight.shape[-1] // 2
     planes = F.conv2d(F.pad(planes, (border,) * 4, mode="replicate"), weight.to(planes), bias.to(planes))
     return planes.reshape(*signal.shape[:-3], *planes.shape[-3:])

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.precision import full_precision
 
 SEEN_AT_ONCE = 2**20
 """Pixels; a larger picture is painted in tiles."""
@@ -27,11 +28,16 @@ DARKEST = 0.03
 class _Conv(nn.Conv2d):
     """A convolution that continues the picture by its border."""
 
+    bias: nn.Parameter
+
     def __init__(self, channels: int, out: int, side: int, *, stride: int = 1, dilation: int = 1) -> None:
         border = dilation * (side // 2)
         super().__init__(
             channels, out, side, stride=stride, dilation=dilation, padding=border, padding_mode="replicate"
         )
+
+    def reset_parameters(self) -> None:
+        """Nothing: torch's would draw from the global generator, and the stage sets them."""
 
 
 class _Norm(nn.Module):
@@ -87,8 +93,8 @@ class StyleStage(Stage):
                noise: planes of white noise at full size, directions of drawn-out noise, which has two planes for each,
                and planes of white noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
-    Raises:    ValueError for a width, a dilation or a number of planes that is not positive, a negative level, and at
-               the call for another number of channels than 3.
+    Raises:    ValueError for a width or a dilation below 1, anything but three numbers of planes >= 0, a level that is
+               negative or not finite, and at the call for another number of channels than 3.
     Source:    Johnson, Alahi and Fei-Fei, Perceptual losses for real-time style transfer and super-resolution (2016);
                Ulyanov et al., Texture networks (2016), the noise; instance normalisation (2016).
     """
@@ -102,20 +108,16 @@ class StyleStage(Stage):
         level: float = 1.0,
     ) -> None:
         super().__init__()
-        for name, values in (("width", (width,)), ("dilations", tuple(dilations)), ("noise", tuple(noise))):
-            if not values or not all(isinstance(value, int) and value >= (name != "noise") for value in values):
+        for name, values in (("width", (width,)), ("dilations", tuple(dilations))):
+            if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
-        if not level >= 0:
-            raise ValueError(f"level must be a number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
+        if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
+            raise ValueError(f"noise must be three whole numbers >= 0, such as (3, 4, 8), got {noise!r}.")
+        if not 0 <= level < math.inf:
+            raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.level = width, tuple(dilations), level
-        self.noise: Any = tuple(noise)
+        self.noise = (noise[0], noise[1], noise[2])
         half, quarter = 2 * width, 4 * width
-        with torch.random.fork_rng(devices=[]):  # torch's layers draw their own start first
-            self._build(width, half, quarter)
-        self._start()
-
-    def _build(self, width: int, half: int, quarter: int) -> None:
-        noise = self.noise
         self.enter, self.enter_norm = _Conv(3 + noise[0] + 2 * noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
         self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
@@ -125,14 +127,18 @@ class StyleStage(Stage):
         self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
         self.leave = _Conv(2 * width, 3, 5)
         self.colour = nn.Parameter(torch.eye(3))
+        self._start()
 
     def _start(self) -> None:
         """The same start every time, whatever torch's own generator has given to others."""
         seeded = torch.Generator("cpu").manual_seed(0)
         for layer in self.modules():
             if isinstance(layer, _Conv):
-                nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=seeded)
-                nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+                start = torch.empty(layer.weight.shape, dtype=layer.weight.dtype, device="cpu")
+                nn.init.kaiming_uniform_(start, a=math.sqrt(5), generator=seeded)
+                with torch.no_grad():
+                    layer.weight.copy_(start)
+                    layer.bias.zero_()
         nn.init.zeros_(self.leave.weight)
 
     @property
@@ -157,10 +163,10 @@ class StyleStage(Stage):
         if signal.numel() == 0:
             return signal
         height, width = signal.shape[-2:]
-        whole = F.pad(signal, (0, -width % 4, 0, -height % 4), mode="replicate")
+        whole = F.pad(signal.to(self.colour.dtype), (0, -width % 4, 0, -height % 4), mode="replicate")
         noise = self._noise(whole, (context or Context()).generator)
         painted = self._paint(whole, noise) if height * width <= SEEN_AT_ONCE else self._in_tiles(whole, noise)
-        return painted[..., :height, :width]
+        return painted[..., :height, :width].to(signal.dtype)
 
     def _noise(self, picture: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Planes at full size and at a quarter, for the whole picture."""
@@ -183,8 +189,12 @@ class StyleStage(Stage):
         )
         if drawn_out:
             kernels = stroke_kernels(drawn_out).to(picture)
-            thin, wide = (F.conv2d(strokes, kernels, groups=drawn_out) for strokes in (thin, wide))
-            fine = torch.cat([fine, thin, _doubled(wide)], dim=1)
+            around = 2 * LONGEST
+            fine = torch.cat([fine, fine.new_empty(batch, 2 * drawn_out, height, width)], dim=1)
+            for top in range(0, height, TILE):  # torch pads a few planes to sixteen: of 12 megapixels, 0.8 GB
+                strip = thin[..., top : top + TILE + around, :]
+                fine[:, white : white + drawn_out, top : top + TILE] = F.conv2d(strip, kernels, groups=drawn_out)
+            fine[:, white + drawn_out :] = _doubled(F.conv2d(wide, kernels, groups=drawn_out))
         return self.level * fine, self.level * coarse
 
     def _paint(
@@ -201,8 +211,9 @@ class StyleStage(Stage):
             x = block(x, *how)
         x = F.relu(self.up1_norm(self.up1(_doubled(x)), *how))
         x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
-        change = self.leave(torch.cat([x, fine], dim=1))
-        return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + change)
+        strokes = self.leave(torch.cat([x, fine], dim=1)).to(coded)
+        with full_precision(coded.device):  # autocast may round what is painted, not what is kept
+            return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + strokes)
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
         """A large picture, tile by tile with a border as wide as the reach: bounded memory, no seams."""
@@ -225,7 +236,7 @@ class StyleStage(Stage):
 
 
 def stroke_kernels(count: int) -> Tensor:
-    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25), of squares that sum to 1."""
+    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25), that keep the variance of noise."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
     angle = torch.arange(count, dtype=torch.float64)[:, None, None] * (math.pi / count)

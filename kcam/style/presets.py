@@ -90,10 +90,10 @@ class Preset:
 
     def for_scenes(self, count: int, **changes: Any) -> Settings:
         """The settings for so many training scenes, some of them changed."""
-        settings = self.settings
-        if self.epochs is not None:
+        settings = replace(self.settings, **changes)
+        if self.epochs is not None and "steps" not in changes:
             settings = replace(settings, steps=self.epochs * math.ceil(count / settings.batch))
-        return replace(settings, **changes)
+        return settings
 
 
 PAINTED: dict[str, Any] = {"colour": 0.7, "content": 0.4, "levels": (2, 4), "window": 15}

@@ -49,11 +49,13 @@ class BuiltinScenes:
         self.size = size
         self.scenes: list[tuple[str, Scene]] = []
         for name in names:
+            if name not in PHOTOGRAPHS:
+                raise ValueError(f"no built-in photograph {name!r}. There are: {', '.join(PHOTOGRAPHS)}.")
             whole = Scene.builtin(name).with_depth(DISTANCE)
             longest = max(whole.shape[1:])
             for scale in SCALES:
                 scene = whole.resized(round(longest * scale))
-                if min(scene.shape[1:]) >= size:
+                if 1 <= size <= min(scene.shape[1:]):
                     self.scenes.append((f"{name} at {scale:g}", scene))
         if not self.scenes:
             raise ValueError(f"no built-in photograph holds a crop of {size} pixels. Use a size of at most 300.")

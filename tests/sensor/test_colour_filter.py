@@ -8,7 +8,7 @@ from torch import nn
 from kcam import spectral
 from kcam.context import Context
 from kcam.sensor import ColourFilter, fit_gaussians, mosaic
-from kcam.sensor.colour_filter import fitted, gaussian_basis
+from kcam.sensor.colour_filter import LEAST_ALPHA, fitted, gaussian_basis
 from kcam.units import nm, wavelength_grid
 
 FINE = torch.arange(400, 741, dtype=torch.float64) * nm
@@ -243,3 +243,68 @@ def test_bands_and_wavelengths_must_agree():
         kodak.finish(torch.rand(1, 28, 4, 4))
     with pytest.raises(ValueError, match=r"expects the 12 planes.*got shape \(1, 3, 4, 4\)"):
         ColourFilter.learned(2).finish(torch.rand(1, 3, 4, 4))
+
+
+TO_TRAIN = {
+    "kodak": ColourFilter.kodak,
+    "nikon": lambda: ColourFilter.nikon(infrared_cut=650 * nm),
+    "sigma": ColourFilter.sigma,
+    "rgbw": ColourFilter.rgbw,
+    "tile": lambda: ColourFilter(torch.rand(3, 2, 12) * (torch.rand(3, 2, 12) > 0.5)),
+    "dark": lambda: ColourFilter(torch.zeros(1, 12)),
+}
+
+
+@pytest.mark.parametrize("name", TO_TRAIN)
+def test_a_trainable_filter_starts_as_its_curves(name):
+    torch.manual_seed(0)
+    fixed = TO_TRAIN[name]()
+    learned = fixed.trainable()
+    assert isinstance(learned.coefficients, nn.Parameter)
+    assert learned.softplus
+    assert (learned.width, learned.infrared_cut, learned.is_tile) == (fixed.width, fixed.infrared_cut, fixed.is_tile)
+    # float32 behind a softplus of values up to 12: a rounding of 1e-6 at most
+    torch.testing.assert_close(learned.alpha(), fixed.alpha().clamp(min=LEAST_ALPHA), atol=2e-6, rtol=0)
+    raised = learned.response(FINE) - fixed.response(FINE)
+    # Gaussians that add up to at most 1.04 (see the first test), each raised by 0.01 at most
+    assert raised.min() > -1e-5
+    assert raised.max() < 1.04 * LEAST_ALPHA + 1e-5
+    torch.testing.assert_close(fixed.coefficients, before := fixed.coefficients.clone())  # it is another filter
+    with torch.no_grad():
+        learned.coefficients += 1
+    assert torch.equal(fixed.coefficients, before)
+
+
+@pytest.mark.parametrize("name", TO_TRAIN)
+def test_every_coefficient_of_a_trainable_filter_learns(name):
+    torch.manual_seed(0)
+    learned = TO_TRAIN[name]().trainable()
+    channels = 1 if learned.is_tile else len(learned.coefficients)
+    bands = torch.rand(1, 28, 6, 6) + 0.1
+    (learned(bands) * torch.arange(1, channels + 1)[:, None, None]).sum().backward()
+    gradient = learned.coefficients.grad
+    assert gradient.isfinite().all()
+    # the slope of the softplus at 0.01 is 0.095; an infrared cut at 650 nm leaves 5e-4 of the last Gaussian, at 720 nm
+    slope = 1 - math.exp(-10 * LEAST_ALPHA)
+    assert gradient.min() > 0.5 * slope * gradient.max() * (5e-5 if learned.infrared_cut else 5e-2)
+
+
+@pytest.mark.parametrize("step", [-1e4, -3.0, 3.0, 1e4])
+@pytest.mark.parametrize("name", TO_TRAIN)
+def test_a_trainable_filter_is_not_negative_after_a_wild_step(name, step):
+    learned = TO_TRAIN[name]().trainable()
+    with torch.no_grad():
+        learned.coefficients += step * torch.randn(learned.coefficients.shape, generator=torch.manual_seed(0))
+    assert (learned.alpha() >= 0).all()
+    assert learned.alpha().isfinite().all()
+    result = learned(torch.rand(1, 28, 4, 4))
+    assert (result >= 0).all()
+    result.sum().backward()
+    assert learned.coefficients.grad.isfinite().all()
+    assert (learned.coefficients.grad >= 0).all()  # less than no light is never asked for
+
+
+def test_training_a_trained_filter_changes_nothing():
+    once = ColourFilter.nikon().trainable()
+    torch.testing.assert_close(once.trainable().alpha(), once.alpha(), atol=1e-6, rtol=0)
+    assert ColourFilter(torch.rand(1, 12).double()).trainable().coefficients.dtype == torch.float32

@@ -139,7 +139,7 @@ def test_document_comes_back_exactly(tmp_path: Path):
     [
         ({"a": [torch.ones(1)]}, "cannot save document['a'][0]: tensor([1.]) is a Tensor, and must be None, bool"),
         ({"a": {1: 2}}, "cannot save document['a']: {1: 2} is a dict, and must be None, bool"),
-        ({"a": {"float": "nan"}}, "(and not the one key \"float\")"),
+        ({"a": {"float": "nan"}}, '(and not the one key "float")'),
         ({"a": {1, 2}}, "is a set"),
     ],
 )
