@@ -16,9 +16,9 @@ from kcam.precision import full_precision
 SEEN_AT_ONCE = 2**20
 """Pixels; a larger picture is painted in tiles."""
 TILE = 512
-LENGTH = 6.0
-"""Standard deviation of drawn-out noise along its direction [pixels]."""
-LONGEST = 12
+LENGTH, WIDTH = 7.0, 1.5
+"""Standard deviations of drawn-out noise along its direction and across [pixels]."""
+LONGEST = 14
 WINDOWS = 4
 """Across and down: where the statistics of a picture in tiles are taken."""
 DARKEST = 0.03
@@ -80,7 +80,7 @@ class StyleStage(Stage):
     convolution also sees what the first one made: the detail of the picture and of the noise.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
     the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
-    Gaussians 6 pixels long and 1 wide and twice as large ones, along directions that divide the half circle: from white
+    Gaussians 7 pixels long and 1.5 wide and twice as large ones, along directions that divide the half circle: from white
     noise alone a small network learns grain before it learns strokes. As it is built it changes
     nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
@@ -236,12 +236,12 @@ class StyleStage(Stage):
 
 
 def stroke_kernels(count: int) -> Tensor:
-    """Gaussians of sigma 6 by 1 pixels along `count` directions, (count,1,25,25), that keep the variance of noise."""
+    """Gaussians of sigma 7 by 1.5 pixels along `count` directions, (count,1,29,29), that keep the variance of noise."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
     angle = torch.arange(count, dtype=torch.float64)[:, None, None] * (math.pi / count)
     along, across = x * torch.cos(angle) + y * torch.sin(angle), y * torch.cos(angle) - x * torch.sin(angle)
-    kernels = torch.exp(-(along**2) / (2 * LENGTH**2) - across**2 / 2)
+    kernels = torch.exp(-(along**2) / (2 * LENGTH**2) - across**2 / (2 * WIDTH**2))
     return (kernels / kernels.square().sum((-2, -1), keepdim=True).sqrt())[:, None]
 
 
