@@ -38,7 +38,8 @@ WORK = ROOT / ".style-bench"
 RESULT = ROOT / "benchmarks" / "results" / "style.json"
 HALF = 256
 SIZE = 256
-CAMERA_STEPS = 200
+CAMERA_STEPS = 150
+THESIS_STEPS = 300
 SEED = 5  # of the shots
 
 
@@ -69,7 +70,7 @@ def thesis_camera(*, ordinary: bool = False, straight_through: bool = False) -> 
     learned = sensor.ColourFilter.learned(28)
     signed = sensor.ColourFilter(nn.Parameter(learned.alpha().detach()), width=learned.width)
     seeded = torch.Generator().manual_seed(0)
-    weight = nn.Parameter(torch.randn(3, 1, 3, 3, generator=seeded) / 3)
+    weight = nn.Parameter((2 * torch.rand(3, 1, 3, 3, generator=seeded) - 1) / 3)  # as networks start: 1 / sqrt(9)
     clip: Callable[[], nn.Module] = isp.Clip if straight_through else HardClip
     return Camera(imaging, signed, sensor.Exposure(), clip(), isp.LearnedDemosaic(weight), clip())
 
@@ -89,10 +90,10 @@ OURS = ("optics", "filter", "convolution", "stage")
 QUICK = PRESETS["quick"]
 RATES = QUICK.settings.rates
 CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS)
-THESIS_LOSS = {"statistic": "gram", "style": 30.0, "colour": 0.0, "content": 0.0, "l2": 1.0}
+THESIS_LOSS = PRESETS["thesis"].loss
 THESIS = replace(
     PRESETS["thesis"].settings,
-    steps=2 * CAMERA_STEPS,
+    steps=THESIS_STEPS,
     size=128,
     rates={"optics": 1e-3, "filter": 1e-3, "demosaic": 1e-3},
 )
@@ -120,12 +121,12 @@ ARMS: dict[str, Arm] = {
         "straight-through clip", lambda: thesis_camera(straight_through=True), THESIS_LOSS, THESIS, ("strokes",)
     ),
     "thesis, our content": Arm(
-        "correlation in place of L2", thesis_camera, THESIS_LOSS | {"l2": 0.0, "content": 0.6}, THESIS, ("strokes",)
+        "correlation in place of L2", thesis_camera, THESIS_LOSS | {"l2": 0.0, "content": 0.5}, THESIS, ("strokes",)
     ),
     "thesis, our style loss": Arm(
         "relative moments and colours in place of Gram",
         thesis_camera,
-        {"l2": 1.0, "content": 0.0, "colour": 1.0},
+        {"l2": THESIS_LOSS["l2"], "content": 0.0, "colour": 0.7},
         THESIS,
         ("strokes",),
     ),
@@ -133,7 +134,7 @@ ARMS: dict[str, Arm] = {
         "a rate per part, warm-up, cosine, averaging",
         thesis_camera,
         THESIS_LOSS,
-        replace(CAMERA, steps=2 * CAMERA_STEPS, rates={k: RATES[k] for k in ("optics", "filter", "demosaic")}),
+        replace(CAMERA, steps=THESIS_STEPS, rates={k: RATES[k] for k in ("optics", "filter", "demosaic")}),
         ("strokes",),
     ),
 }

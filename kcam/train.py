@@ -103,7 +103,8 @@ def run(
     document: dict[str, Any] = {"options": asdict(options), "style": _hash(picture)}
     document["threads"] = _threads(folder, resume, threads)
     with _threads_set(document["threads"]), _processes(options.device) as (leads, device):
-        _check_folder(folder, document, resume=resume)
+        if leads:  # the others would meet what this one has begun to write
+            _check_folder(folder, document, resume=resume)
         preset = style.PRESETS[options.preset]
         camera = _camera(options, preset).to(device)
         source = _source(options, preset)
@@ -113,7 +114,9 @@ def run(
         )
         weights = {} if options.content is None else {"content": options.content}
         features = style_features(options.features, options.vgg_weights)
-        loss = preset.style_loss(picture.to(device), features=features.to(device), **weights).to(device)
+        loss = preset.style_loss(
+            picture.to(device), features=features.to(device), crop=settings.size, **weights
+        ).to(device)
         start = _camera(options, preset)
         scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0) for name in SHOWN]
         if leads:

@@ -79,10 +79,9 @@ class StyleStage(Stage):
     Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where the last
     convolution also sees what the first one made: the detail of the picture and of the noise.
     Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
-    the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn out, by
-    Gaussians 7 pixels long and 1.5 wide and twice as large ones, along directions that divide the half circle: from white
-    noise alone a small network learns grain before it learns strokes. As it is built it changes
-    nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
+    the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn
+    out, by Gaussians 7 pixels long and 1.5 wide and twice as large ones, along directions that divide the half circle:
+    from white noise alone a small network learns grain before it learns strokes. As it is built it changes nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
     The noise comes from the context's generator: the same generator state, picture and weights give the same bytes. A
     picture of more than a megapixel is painted tile by tile; the statistics that its instance normalisation divides by
@@ -104,7 +103,7 @@ class StyleStage(Stage):
         *,
         width: int = 16,
         dilations: Sequence[int] = (1, 2, 4, 8),
-        noise: tuple[int, int, int] = (3, 4, 8),
+        noise: tuple[int, int, int] = (0, 8, 8),
         level: float = 1.0,
     ) -> None:
         super().__init__()
@@ -112,7 +111,7 @@ class StyleStage(Stage):
             if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
         if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
-            raise ValueError(f"noise must be three whole numbers >= 0, such as (3, 4, 8), got {noise!r}.")
+            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 8, 8), got {noise!r}.")
         if not 0 <= level < math.inf:
             raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.level = width, tuple(dilations), level

@@ -236,6 +236,11 @@ class StyleLoss(nn.Module):
             spread = means - mean
             self.targets[name] = (mean, covariances.mean(0) + spread.T @ spread / len(means))
 
+    def _apply(self, fn: Any, recurse: bool = True) -> StyleLoss:
+        super()._apply(fn, recurse)
+        self.targets = {name: tuple(fn(value) for value in target) for name, target in self.targets.items()}
+        return self
+
     def _statistics(self, layer: Tensor) -> tuple[Tensor, ...]:
         return moments(layer) if self.statistic == "moments" else (gram_matrix(layer),)
 

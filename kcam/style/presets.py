@@ -68,6 +68,10 @@ def smooth_phase(side: int) -> Tensor:
     return (DOE_START * phase / phase.square().mean().sqrt()).float()
 
 
+THESIS_L2 = 300.0
+"""The thesis gives no weights; with this one its two terms are of one size where training starts."""
+
+
 @dataclass(frozen=True)
 class Preset:
     """A way to train. note: for the help. camera: makes it. loss: arguments of `StyleLoss`. settings: of `fit`.
@@ -83,10 +87,10 @@ class Preset:
 
     def style_loss(self, picture: Tensor, *, features: nn.Module | None = None, **changes: Any) -> StyleLoss:
         """The loss for a style picture, with some of its arguments changed."""
-        how = self.loss | changes
+        how = {"crop": self.settings.size} | self.loss | changes
         if features is not None and features.name != "steerable":
             how = {"content_by": "features", "content_layer": "relu3_3"} | how
-        return StyleLoss(picture, features=features, crop=self.settings.size, **how)
+        return StyleLoss(picture, features=features, **how)
 
     def for_scenes(self, count: int, **changes: Any) -> Settings:
         """The settings for so many training scenes, some of them changed."""
@@ -96,7 +100,7 @@ class Preset:
         return settings
 
 
-PAINTED: dict[str, Any] = {"colour": 0.7, "content": 0.4, "levels": (2, 4), "window": 15}
+PAINTED: dict[str, Any] = {"colour": 0.7, "content": 0.5, "levels": (2, 4), "window": 15}
 """Contents are measured from half the size on, which leaves room for strokes."""
 
 PRESETS: dict[str, Preset] = {
@@ -115,7 +119,7 @@ PRESETS: dict[str, Preset] = {
     "thesis": Preset(
         "the thesis's network and settings, its table 4.1: batch 2, 50 epochs, Adam",
         Camera.thesis,
-        {"statistic": "gram", "colour": 0.0, "content": 0.0, "l2": 1.0},
+        {"statistic": "gram", "colour": 0.0, "content": 0.0, "l2": THESIS_L2},
         Settings(
             size=256,
             rates={"optics": 1e-3, "filter": 1e-3, "demosaic": 1e-3},

@@ -38,6 +38,7 @@ PARTS: dict[str, tuple[type[nn.Module], ...]] = {
 NOISE_STREAM = 2**40  # streams of the camera's noise lie beyond those of the scenes, one per row each
 DIVERGED = 10.0  # times the median of the last losses
 MEMORY = 50  # losses
+LOOK = 20  # steps between looks at the pictures
 MOST_RETURNS = 3
 CLIPPED, NEGATIVE, DEAD = 0.1, 0.3, 0.05
 
@@ -70,7 +71,7 @@ class Settings:
     size: int = 128
     seed: int = 0
     rates: dict[str, float] = field(
-        default_factory=lambda: {"optics": 0.01, "filter": 0.05, "demosaic": 0.01, "tone": 0.01, "stage": 1e-2}
+        default_factory=lambda: {"optics": 0.01, "filter": 0.05, "demosaic": 0.01, "tone": 0.01, "stage": 2e-2}
     )
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.0
@@ -238,7 +239,7 @@ def fit(
         run.take_step()
         if advance is not None and run.history:
             advance(Progress(run.step, run.terms(), run.clock.total()))
-        stopped = stop is not None and stop()
+        stopped = _anywhere(stop is not None and stop(), run.world)
         if run.step % settings.every == 0 or run.step == settings.steps or stopped:
             run.save()
             if on_checkpoint is not None and run.leads:
@@ -336,7 +337,7 @@ class _Run:
                 self.average[name].lerp_(p, 1 - past)
         self.history.append(values)
         self.clock.mark("update")
-        if self.step % 20 == 0:
+        if self.step % LOOK == 0:
             self._look(picture.detach(), scene)
 
     def _what_is_wrong(self, values: list[float], norm: float) -> str | None:
@@ -555,6 +556,17 @@ def _mean_over_processes(values: Tensor, world: int) -> Tensor:
     if world > 1:
         torch.distributed.all_reduce(values)
     return values / world
+
+
+def _anywhere(said: bool, world: int) -> bool:
+    """Whether one of the processes says so: they stop together."""
+    if world == 1:
+        return said
+    flag = torch.tensor(float(said))
+    if torch.distributed.get_backend() == "nccl":
+        flag = flag.cuda()
+    torch.distributed.all_reduce(flag)
+    return bool(flag > 0)
 
 
 def _difference(key: str, there: Any, here: Any) -> str:

@@ -161,16 +161,17 @@ def test_going_back_survives_a_resume(tmp_path: Path) -> None:
 
 class Wild(StyleLoss):
     def terms(self, picture, scene=None, *, recorded=None, turn=None):
-        scale = 1e4 if turn == 60 and not self.__dict__.setdefault("seen", []) else 1.0
+        scale = 1e4 if turn == 8 and not self.__dict__.setdefault("seen", []) else 1.0
         if scale > 1:
             self.seen.append(turn)
         return {"style": scale * (picture.mean() + 1)}
 
 
-def test_a_diverging_loss_goes_back() -> None:
+def test_a_diverging_loss_goes_back(monkeypatch) -> None:
+    monkeypatch.setattr("kcam.style.training.MEMORY", 6)
     loss = Wild(tiny.painting("woodcut", size=128)[:, : tiny.SIZE, : tiny.SIZE])
-    with pytest.warns(StyleWarning, match=r"step 60: the loss is .* times its recent median"):
-        trained = train(None, loss=loss, steps=62, every=20, rates={"demosaic": 1e-4})
+    with pytest.warns(StyleWarning, match=r"step 8: the loss is .* times its recent median"):
+        trained = train(None, loss=loss, steps=10, every=5, rates={"demosaic": 1e-4})
     assert trained.finished
 
 
@@ -219,9 +220,10 @@ def test_a_plan_is_frozen_and_kept(tmp_path: Path) -> None:
     assert torch.equal(train(tmp_path, tolerance=0.02, resume=True).history, trained.history)
 
 
-def test_warnings_of_negative_clipped_and_blind() -> None:
+def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
+    monkeypatch.setattr("kcam.style.training.LOOK", 2)
     inverted = nn.Parameter(-torch.eye(3)[:, :, None, None].repeat(1, 1, 3, 3) / 9)
-    still = tiny.settings(steps=20, rates={"demosaic": 1e-6})
+    still = tiny.settings(steps=2, rates={"demosaic": 1e-6})
     stages = list(tiny.camera(stage=False))
     stages[7] = isp.Convolution(inverted, nn.Parameter(torch.full((3,), 0.3)))
     with warnings.catch_warnings(record=True) as caught:
@@ -236,7 +238,8 @@ def test_warnings_of_negative_clipped_and_blind() -> None:
     assert any("they clip" in str(w.message) for w in caught)
 
 
-def test_a_channel_that_goes_blind_is_told() -> None:
+def test_a_channel_that_goes_blind_is_told(monkeypatch) -> None:
+    monkeypatch.setattr("kcam.style.training.LOOK", 2)
     camera = tiny.camera(stage=False)
 
     class Darkening(tiny.BuiltinScenes):
@@ -248,7 +251,7 @@ def test_a_channel_that_goes_blind_is_told() -> None:
     source = Darkening(tiny.SIZE, names=["chelsea"])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fit(camera, tiny.loss(), source=source, settings=tiny.settings(steps=20))
+        fit(camera, tiny.loss(), source=source, settings=tiny.settings(steps=2))
     assert any("channel [0] of the colour filter has gone blind" in str(w.message) for w in caught)
 
 
@@ -352,7 +355,7 @@ def test_scene_is_untouched_by_training() -> None:
 def test_a_dead_filter_cannot_go_negative() -> None:
     """Softplus: whatever is learnt, light is absorbed."""
     camera = tiny.camera(stage=False)
-    fit(camera, tiny.loss(content=0), source=tiny.source(), settings=tiny.settings(steps=10, rates={"filter": 2.0}))
+    fit(camera, tiny.loss(content=0), source=tiny.source(), settings=tiny.settings(steps=5, rates={"filter": 2.0}))
     assert isinstance(camera[1], sensor.ColourFilter)
     assert (camera[1].alpha() >= 0).all()
     assert isinstance(camera[0], optics.Imaging)
