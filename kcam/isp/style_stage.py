@@ -77,11 +77,12 @@ class StyleStage(Stage):
     y = sigmoid( M logit(x) + network(x, noise) )
 
     Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where the last
-    convolution also sees what the first one made: the detail of the picture and of the noise.
-    Without noise a network that sees only the picture must leave an even area even; planes of Gaussian noise, beside
-    the picture and at a quarter of its size, let strokes grow there (as in texture networks). Some are drawn
-    out, by Gaussians 7 pixels long and 1.5 wide and twice as large ones, along directions that divide the half circle:
-    from white noise alone a small network learns grain before it learns strokes. As it is built it changes nothing but values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
+    convolution also sees what the first one made: the detail of the picture and of the noise. Without noise a network
+    that sees only the picture must leave an even area even; planes of Gaussian noise, beside the picture and at a
+    quarter of its size, let strokes grow there (as in texture networks). Those beside the picture are drawn out, by
+    Gaussians 7 pixels long and 1.5 wide and by twice as large ones, along directions that divide the half circle: from
+    white noise a small network learns grain before it learns strokes. As it is built it changes nothing but values
+    below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
     The noise comes from the context's generator: the same generator state, picture and weights give the same bytes. A
     picture of more than a megapixel is painted tile by tile; the statistics that its instance normalisation divides by
