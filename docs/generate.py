@@ -618,11 +618,13 @@ STYLE_MEASURES = {
 
 
 def style_rows(name: str) -> list[dict[str, Any]]:
+    """The runs of the thesis's arrangement and its repairs, or of ours."""
     rows = json.loads((RESULTS / "style.json").read_text())["rows"]
     return [row for row in rows if row["arm"].startswith("thesis") == (name == "thesis")]
 
 
 def style_line(row: dict[str, Any]) -> str:
+    """The measures of a run, as cells."""
     mean = row["mean"]
     gaps = (f"{100 * mean[key]:.0f} %" for key in list(STYLE_MEASURES)[:3])
     correlations = (f"{mean[key]:.2f}" for key in list(STYLE_MEASURES)[3:])
