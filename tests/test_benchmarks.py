@@ -303,8 +303,8 @@ def test_a_step_is_raced_in_parts_and_whole(tmp_path):
         assert rows[0]["baseline"]
         assert [row["who"] for row in rows if row["default"]] == ["kcam"]
     whole = {row["who"]: row["error"]["loss"] for row in content["rows"] if "loss" in row["error"]}
-    # the point samples of a PSF are another quantity than its light in the pixels
-    assert whole["kcam"] < whole["textbook, 2 x 2 a pixel"] < whole["textbook, points"]
+    # measured 4e-8, 1.3e-3 and 2.8e-3: a staircase rim, and point samples in place of the light in the pixels
+    assert 100 * whole["kcam"] < whole[style_step.SPARED_PIXELS] < whole["textbook, points"]
     assert content["targets"] == content["projected"] == []
 
 
