@@ -527,7 +527,8 @@ def measured(row: dict[str, Any]) -> str:
     """Time, error and memory of a row in one cell."""
     seconds = row["seconds"]
     time = f"{figures(seconds * 1e3)} ms" if seconds < 1 else f"{figures(seconds)} s"
-    error = row["error"].get("l1_median", row["error"].get("relative_max"))
+    kinds = ("l1_median", "relative_max", "loss")
+    error = next((row["error"][kind] for kind in kinds if kind in row["error"]), None)
     memory = row.get("peak_memory")
     cells = [
         ("~" if row.get("share_timed", 1.0) < 1 else "") + time,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import sys
@@ -16,7 +17,7 @@ from rich.console import Console
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from benchmarks import augmentation, bench, peers
+from benchmarks import augmentation, bench, peers, style_step
 from benchmarks import patches as patch_stores
 from benchmarks.common import Contestant, race
 from kcam import augmentation as KC
@@ -233,3 +234,92 @@ def test_patch_stores_are_timed_side_by_side(tmp_path):
     assert all(row["MB_per_second"] > 0 for row in content["extraction"])
     assert content["extraction"][0]["bytes"] == 2 * (25 * 4 * 32 * 32 * 2 + 128)
     assert [path.name for path in tmp_path.iterdir()] == ["patches.json"]
+
+
+# ---- a training step of preset thesis ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def step() -> style_step.Bench:
+    return style_step.Bench(style_step.QUICK)
+
+
+def loss_of(bench: style_step.Bench, take) -> dict[str, float]:
+    with torch.no_grad():
+        picture, recorded = take(bench.scene)
+        terms = bench.loss.terms(picture, bench.shown, recorded=recorded)
+    return bench.loss_error({name: float(term) for name, term in terms.items()})
+
+
+def check_against_unfused(bench: style_step.Bench) -> None:
+    """kcam's step as training runs it: the loss and the gradients of the unfused float64 path."""
+    camera = bench.cameras[True]
+    gradients, terms = bench.whole_step(camera, lambda: style_step.kcam_picture(camera, bench.scene))
+    assert bench.loss_error(terms)["loss"] < 1e-4  # what issue 8 asks; 4e-8 at toy sizes, float32 against float64
+    assert gradients.keys() == {"DOE", "filter", "convolution"}
+    for name, error in bench.errors(gradients, kind="whole").items():
+        # measured 1e-6 relative in float32; a lost band, a turned PSF or a detached path is off by tenths
+        assert error < 1e-3, name
+
+
+def test_the_cubes_of_a_step_have_no_factors(step):
+    assert step.scene.spectra is None
+    bands = step.scene.bands().transpose(0, 1).flatten(1).double()
+    values = torch.linalg.svdvals(bands)
+    assert values[-1] > 1e-2 * values[0]  # without texture: three spectra, and 1e-7
+
+
+def test_a_step_has_the_loss_of_the_unfused_float64_path(step):
+    check_against_unfused(step)
+
+
+@pytest.mark.slow
+def test_a_step_of_the_real_sizes_has_the_loss_of_the_unfused_float64_path():
+    check_against_unfused(style_step.Bench(style_step.Sizes()))
+
+
+def test_a_finely_sampled_textbook_comes_to_the_loss_of_a_step(step):
+    camera = copy.deepcopy(step.cameras[True])
+    as_timed = loss_of(step, style_step.Textbook(camera, step.sizes, oversample=2))
+    doe = style_step.doe_of(camera)
+    # the same DOE, each pixel sampled 4 x 4 times: light beyond one sample's diffraction and the rim's staircase
+    doe.phase = torch.nn.Parameter(doe.phase.detach().repeat_interleave(4, 0).repeat_interleave(4, 1))
+    finer = loss_of(step, style_step.Textbook(camera, step.sizes, oversample=4))
+    assert finer["loss"] < 1e-4  # measured 1.6e-5; 3e-6 with 8 x 8 and 6 x 6 a sensor's pixel
+    assert finer["loss, l2"] < 1.5e-3  # measured 4.6e-4: a small difference of two signals
+    assert as_timed["loss"] > 5 * finer["loss"]  # measured 1.3e-3: what is timed is the coarser one
+
+
+def test_a_step_is_raced_in_parts_and_whole(tmp_path):
+    assert style_step.main(["--quick", "--out", str(tmp_path / "step.json")]) == 0
+    content = json.loads((tmp_path / "step.json").read_text())
+    races = {}
+    for row in content["rows"]:
+        races.setdefault((row["op"], row["direction"]), []).append(row)
+        assert row["seconds"] > 0
+        assert all(math.isfinite(value) for value in row["error"].values())
+    assert len(races) == 2 * 2 + 1
+    for rows in races.values():
+        assert rows[0]["baseline"]
+        assert [row["who"] for row in rows if row["default"]] == ["kcam"]
+    whole = {row["who"]: row["error"]["loss"] for row in content["rows"] if "loss" in row["error"]}
+    # measured 4e-8, 1.3e-3 and 2.8e-3: a staircase rim, and point samples in place of the light in the pixels
+    assert 100 * whole["kcam"] < whole[style_step.SPARED_PIXELS] < whole["textbook, points"]
+    assert content["targets"] == content["projected"] == []
+
+
+@pytest.mark.parametrize(("ratio", "loss", "met"), [(6.1, 1e-5, [True, True]), (5.9, 2e-4, [False, False])])
+def test_a_step_is_judged_as_issue_8_asks(ratio, loss, met):
+    common = {"direction": "forward", "who": "kcam", "error_ratio": None, "default": True, "ratio": ratio}
+    rows = [
+        common | {"op": "preset thesis: camera, textbook by points", "error": {}},
+        common | {"op": "preset thesis: whole step", "error": {"loss": loss}},
+    ]
+    rows += [row | {"default": False, "who": "textbook"} for row in rows]
+    assert [verdict["met"] for verdict in style_step.verdicts_of(rows)] == met
+
+
+def test_fifty_epochs_of_kaist_are_projected_from_a_step():
+    (row,) = style_step.projected([{"who": "kcam", "seconds": 3.6}])
+    assert row["steps"] == 50 * 1950  # 3900 patches, two in a step
+    assert row["hours"] == pytest.approx(97.5)

@@ -326,6 +326,25 @@ class Convolution:
         # conjugated in memory: a lazy conjugate would be copied at every product
         return torch.fft.fft(along_x, n=self.size[0], dim=-2).conj_physical_()
 
+    def transfer_adjoint(self, d_transfer: Tensor) -> Tensor:
+        """Gradient to the kernels (..., h, w), from that to their transfer functions times the number of points."""
+        # only the rows that a kernel has go on to the second transform
+        rows = torch.fft.ifft(d_transfer, dim=-2)[..., : self.window[0], :]
+        return torch.fft.irfft(rows, n=self.size[1])[..., : self.window[1]]
+
+    @property
+    def points(self) -> int:
+        """Of a half spectrum."""
+        return self.size[0] * (self.size[1] // 2 + 1)
+
+    def buffer(self, like: Tensor) -> Tensor:
+        """Room for the half spectra of as many bands as are computed at once, real and imaginary part last."""
+        return like.new_empty(self.bands, self.size[0], self.size[1] // 2 + 1, 2)
+
+    def parts(self, count: int) -> list[range]:
+        """So many bands, as many at once as there is room for."""
+        return [range(start, min(start + self.bands, count)) for start in range(0, count, self.bands)]
+
     def back(self, spectrum: Tensor) -> Tensor:
         """The picture of a spectrum."""
         return torch.fft.irfft2(spectrum, s=self.size)[..., : self.picture[0], : self.picture[1]]
@@ -334,28 +353,28 @@ class Convolution:
 class Contraction(torch.autograd.Function):
     """sum_l kappa_cl H_l (sum_k S_kl C_k), a few bands at a time in one small buffer; nothing but the inputs is kept.
 
-    All bands at once would take hundreds of megabytes, and most of the time would go into touching them first.
+    All bands at once would take hundreds of megabytes, and most of the time would go into touching them first. What a
+    batch shares, a band's transfer function and the way back of its gradient, is computed once for all its pictures.
     """
 
     @staticmethod
     def forward(ctx, planes, psfs, spectra, weights, kept, convolution):
         ctx.save_for_backward(planes, psfs, spectra, weights, kept)
         ctx.convolution = convolution
-        batch, bands, channels = planes.shape[0], psfs.shape[0], weights.shape[0]
+        channels = weights.shape[0]
         factors = None if spectra is None else convolution.transform(planes)
-        result = []
-        for b in range(batch):
-            total = planes.new_zeros(channels, 2 * convolution.size[0] * (convolution.size[1] // 2 + 1))
-            buffer = planes.new_empty(convolution.bands, convolution.size[0], convolution.size[1] // 2 + 1, 2)
-            for start in range(0, bands, convolution.bands):
-                part = range(start, min(start + convolution.bands, bands))
-                for slot, index in enumerate(part):
+        totals = planes.new_zeros(planes.shape[0], channels, 2 * convolution.points)
+        buffer = convolution.buffer(planes)
+        for part in convolution.parts(psfs.shape[0]):
+            transfers = [_band_transfer(convolution, psfs, kept, index) for index in part]
+            for b, total in enumerate(totals):
+                for slot, (index, transfer) in enumerate(zip(part, transfers, strict=True)):
                     spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
-                    transfer = _band_transfer(convolution, psfs, kept, index)
                     torch.mul(spectrum, transfer, out=torch.view_as_complex(buffer[slot]))
                 total.addmm_(weights[:, part.start : part.stop], buffer[: len(part)].flatten(1))
-            result.append(convolution.back(torch.view_as_complex(total.view(channels, convolution.size[0], -1, 2))))
-        return torch.stack(result)
+        return torch.stack(
+            [convolution.back(torch.view_as_complex(total.view(channels, *buffer.shape[1:]))) for total in totals]
+        )
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -363,38 +382,45 @@ class Contraction(torch.autograd.Function):
         planes, psfs, spectra, weights, kept = ctx.saved_tensors
         convolution = ctx.convolution
         need_planes, need_psfs, need_spectra, need_weights = ctx.needs_input_grad[:4]
-        height, width = convolution.window
         factors = None if spectra is None else convolution.transform(planes)
         d_planes = torch.zeros_like(planes) if need_planes else None
         d_factors = torch.zeros_like(factors) if need_planes and spectra is not None else None
-        d_psfs = torch.zeros_like(psfs) if need_psfs else None
+        d_psfs = torch.empty_like(psfs) if need_psfs else None
         d_spectra = torch.zeros_like(spectra) if need_spectra and spectra is not None else None
         d_weights = torch.zeros_like(weights) if need_weights else None
         with full_precision(grad.device):
-            for b in range(planes.shape[0]):
-                # the adjoint of cropping is a picture with nothing around it; of a correlation, a convolution
-                onto = torch.fft.rfft2(grad[b], s=convolution.size)
-                flat = torch.view_as_real(onto).flatten(1)
-                for index in range(psfs.shape[0]):
-                    mixed = (weights[:, index] @ flat).view(*onto.shape[1:], 2)
-                    mixed = torch.view_as_complex(mixed)
-                    transfer = _band_transfer(convolution, psfs, kept, index)
-                    if need_planes or need_spectra:
-                        d_band = mixed * transfer.conj()
-                        if spectra is None and need_planes:
-                            extended = torch.fft.irfft2(d_band, s=convolution.size)
-                            d_planes[b, index] = extend_adjoint(extended, convolution)
-                        if d_factors is not None:
-                            d_factors[b].add_(spectra[:, index, None, None] * d_band)
-                        if d_spectra is not None:
-                            d_spectra[:, index] += _inner(factors[b], d_band, convolution)
-                    if need_psfs or need_weights:
-                        spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
-                        if need_psfs:
-                            d_psf = torch.fft.irfft2(spectrum * mixed.conj(), s=convolution.size)
-                            d_psfs[index] += d_psf[:height, :width]
-                        if need_weights:
-                            d_weights[:, index] += _inner(onto, spectrum * transfer, convolution)
+            # the adjoint of cropping is a picture with nothing around it; of a correlation, a convolution
+            ontos = [torch.fft.rfft2(own, s=convolution.size) for own in grad]
+            buffer = convolution.buffer(planes)
+            for part in convolution.parts(psfs.shape[0]):
+                mixing = weights[:, part.start : part.stop].T
+                d_transfers: list[Tensor] = []
+                transfers = []
+                if need_planes or need_spectra or need_weights:
+                    transfers = [_band_transfer(convolution, psfs, kept, index) for index in part]
+                for b, onto in enumerate(ontos):
+                    torch.mm(mixing, torch.view_as_real(onto).flatten(1), out=buffer[: len(part)].flatten(1))
+                    for slot, index in enumerate(part):
+                        mixed = torch.view_as_complex(buffer[slot])
+                        if need_planes or need_spectra:
+                            d_band = mixed * transfers[slot].conj()
+                            if spectra is None and need_planes:
+                                extended = torch.fft.irfft2(d_band, s=convolution.size)
+                                d_planes[b, index] = extend_adjoint(extended, convolution)
+                            if d_factors is not None:
+                                d_factors[b].add_(spectra[:, index, None, None] * d_band)
+                            if d_spectra is not None:
+                                d_spectra[:, index] += _inner(factors[b], d_band, convolution)
+                        if need_psfs or need_weights:
+                            spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
+                            if need_weights:
+                                d_weights[:, index] += _inner(onto, spectrum * transfers[slot], convolution)
+                            if need_psfs and b == 0:
+                                d_transfers.append(spectrum * mixed.conj())
+                            elif need_psfs:
+                                d_transfers[slot].addcmul_(spectrum, mixed.conj())
+                for index, d_transfer in zip(part, d_transfers, strict=False):
+                    d_psfs[index] = convolution.transfer_adjoint(d_transfer)
             if d_factors is not None:
                 d_planes = extend_adjoint(torch.fft.irfft2(d_factors, s=convolution.size), convolution)
         return d_planes, d_psfs, d_spectra, d_weights, None, None

@@ -830,6 +830,32 @@ def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: i
     assert torch.autograd.gradcheck(contract, inputs)
 
 
+def test_a_batch_shares_the_transforms_of_its_psfs(monkeypatch: pytest.MonkeyPatch) -> None:
+    from kcam.optics.convolution import Contraction, Convolution
+
+    calls = {"transfer": 0, "transfer_adjoint": 0}
+
+    def count(name: str) -> None:
+        whole = getattr(Convolution, name)
+
+        def counted(self, values):
+            calls[name] += 1
+            return whole(self, values)
+
+        monkeypatch.setattr(Convolution, name, counted)
+
+    for name in calls:
+        count(name)
+    batch, bands = 3, 5
+    planes, weights = torch.rand(batch, bands, 12, 10), torch.rand(2, bands)
+    psfs = torch.rand(bands, 5, 4, requires_grad=True)
+    plan = Convolution.of((12, 10), (5, 4), border="reflect", itemsize=4, max_memory=1e9)
+    picture = Contraction.apply(planes, psfs, None, weights, None, plan)
+    assert calls == {"transfer": bands, "transfer_adjoint": 0}
+    picture.sum().backward()
+    assert calls == {"transfer": bands, "transfer_adjoint": bands}  # optics that train alone need no way forth again
+
+
 # ---- what a new user found ---------------------------------------------------------------------------------------
 
 
