@@ -1,4 +1,4 @@
-# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | bench-style | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
+# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | bench-style | bench-styles | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
 PYTHON ?= python3
 VENV ?= .venv
 PEERS ?= .venv-peers
@@ -10,7 +10,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-style bench-data lint types check wheel-test clean
+.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-style bench-styles bench-data lint types check wheel-test clean
 
 help:
 	@head -1 Makefile
@@ -53,8 +53,14 @@ bench: $(VENV)/dev.stamp
 bench-augmentation: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.augmentation
 
+# One step at the thesis's sizes: ten minutes. Four styles and all arms, trained and measured: an hour.
 bench-style: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style_step
+
+bench-styles: $(VENV)/dev.stamp
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style --collect
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style --paint
 
 # The peers come with dependencies of their own, so they get an environment of their own.
 $(PEERS)/peers.stamp: pyproject.toml constraints.txt benchmarks/peers.txt

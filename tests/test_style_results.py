@@ -1,0 +1,43 @@
+"""The committed results of styles: all arms are there, and what the text says of them is so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import style as benchmark
+from kcam.style import STYLES
+
+ROOT = Path(__file__).parents[1]
+ROWS = json.loads((ROOT / "benchmarks" / "results" / "style.json").read_text())["rows"]
+
+
+def mean(style: str, arm: str) -> dict[str, float]:
+    return next(row for row in ROWS if (row["style"], row["arm"]) == (style, arm))["mean"]
+
+
+def test_every_arm_was_run_for_each_of_its_styles() -> None:
+    expected = {(style, name) for name, arm in benchmark.ARMS.items() for style in arm.styles}
+    assert {(row["style"], row["arm"]) for row in ROWS} == expected
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_a_camera_alone_brings_colour_and_no_strokes(style: str) -> None:
+    camera, stage = mean(style, "convolution"), mean(style, "stage")
+    assert camera["oriented_texture"] < 0.15
+    assert stage["oriented_texture"] > camera["oriented_texture"] + 0.2
+    assert stage["training_loss"] > camera["training_loss"] + 0.2
+    assert camera["luminance_correlation"] > 0.9
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_no_shot_is_a_wallpaper(style: str) -> None:
+    row = next(row for row in ROWS if (row["style"], row["arm"]) == (style, "stage"))
+    assert row["wallpaper"] < 0.45
+
+
+@pytest.mark.parametrize("name", ["style", "style-parts", "style-thesis", "painted"])
+def test_pictures_are_of_readme_size(name: str) -> None:
+    assert 50_000 < (ROOT / "docs" / f"{name}.jpg").stat().st_size < 700_000
