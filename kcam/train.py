@@ -19,6 +19,7 @@ from torch import Tensor
 from kcam import __version__, files, plots, report, style
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
+from kcam.style import StyleLoss
 from kcam.style.training import Trained
 
 SHOWN = ("astronaut", "coffee", "chelsea")
@@ -100,6 +101,7 @@ def run(
     if options.preset not in style.PRESETS:
         raise ValueError(f'unknown preset "{options.preset}"; there are: {", ".join(style.PRESETS)}.')
     picture = style_picture(options.style, size=options.style_size)
+    features = style_features(options.features, options.vgg_weights)
     document: dict[str, Any] = {"options": asdict(options), "style": _hash(picture)}
     document["threads"] = _threads(folder, resume, threads)
     with _threads_set(document["threads"]), _processes(options.device) as (leads, device):
@@ -113,28 +115,21 @@ def run(
             len(source), seed=options.seed, **{name: value for name, value in changes.items() if value is not None}
         )
         weights = {} if options.content is None else {"content": options.content}
-        features = style_features(options.features, options.vgg_weights)
         loss = preset.style_loss(
             picture.to(device), features=features.to(device), crop=settings.size, **weights
         ).to(device)
         start = _camera(options, preset)
-        scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0) for name in SHOWN]
+        scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0).to(device=device) for name in SHOWN]
         if leads:
             folder.mkdir(exist_ok=True)
             settled = document | {"settings": asdict(settings), "kcam": __version__, "torch": torch.__version__}
             files.replace(folder / "config.json", (json.dumps(settled, indent=1) + "\n").encode())
 
-        def show(camera: Camera, step: int, history: Tensor, names: Sequence[str]) -> dict[str, Any]:
-            figures = {
-                "sheet": report.style_sheet(camera, style=picture, scenes=scenes, step=step, start=start),
-                "loss": report.loss_figure(history, names),
-            }
-            for name, figure in figures.items():
-                plots.save_figure(figure, folder / f"{name}.png")
-            return figures
+        def show(camera: Camera, step: int, history: Tensor) -> dict[str, Any]:
+            return _show(camera, step, history, folder=folder, style=picture, scenes=scenes, start=start, loss=loss)
 
         def on_checkpoint(camera: Camera, step: int, history: Tensor) -> None:
-            show(camera, step, history, trained_names(loss))
+            show(camera, step, history)
 
         with warnings.catch_warnings(), _stopping() as stopped:
             warnings.showwarning = lambda message, *_: say(str(message))  # type: ignore[assignment]
@@ -151,16 +146,33 @@ def run(
             )
         if leads and trained.finished:
             trained.camera.cpu().save(out)
-            figures = show(trained.camera, len(trained.history), trained.history, trained.names)
+            figures = show(trained.camera, len(trained.history), trained.history)
             _write_report(folder / "report.html", options, settings, trained, figures)
         elif leads:
             say(f"stopped after {len(trained.history)} of {settings.steps} steps; go on with --resume")
     return trained
 
 
-def trained_names(loss: style.StyleLoss) -> tuple[str, ...]:
-    """The columns of the history."""
-    return ("total", *(name for name, weight in loss.weights.items() if weight))
+def _show(
+    camera: Camera,
+    step: int,
+    history: Tensor,
+    *,
+    folder: Path,
+    style: Tensor,
+    scenes: Sequence[Scene],
+    start: Camera,
+    loss: StyleLoss,
+) -> dict[str, Any]:
+    """Draw the contact sheet and the loss curve of a checkpoint into the folder."""
+    names = ("total", *(name for name, weight in loss.weights.items() if weight))
+    figures = {
+        "sheet": report.style_sheet(camera, style=style, scenes=scenes, step=step, start=start),
+        "loss": report.loss_figure(history, names),
+    }
+    for name, figure in figures.items():
+        plots.save_figure(figure, folder / f"{name}.png")
+    return figures
 
 
 def _camera(options: Options, preset: style.Preset) -> Camera:

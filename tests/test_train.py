@@ -24,11 +24,25 @@ def invoke(command: str):
     return CliRunner().invoke(app, command.split())
 
 
+def without_pictures(monkeypatch) -> None:
+    monkeypatch.setattr(train, "_show", lambda *arguments, **named: {})
+    monkeypatch.setattr(train, "_write_report", lambda *arguments: None)
+
+
 def run(out: Path, *, resume: bool = False, threads: int | None = 1, advance=None, **changes):
     lines: list[str] = []
     chosen = {"style": "strokes", "out": str(out), "stage": False} | SMALL | changes
     options = train.Options(**chosen)
     return train.run(options, resume=resume, threads=threads, advance=advance, say=lines.append), lines
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_sheets():
+    """One small scene on the contact sheets, which are drawn at every checkpoint."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "SHOWN", ("coffee",))
+        patch.setattr(train, "SHOWN_SIZE", 48)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +88,8 @@ def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) 
     assert out.read_bytes() == trained.read_bytes()
 
 
-def test_a_run_goes_on_with_its_own_options(tmp_path: Path) -> None:
+def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None:
+    without_pictures(monkeypatch)
     out = tmp_path / "a.safetensors"
     run(out)
     with pytest.raises(ValueError, match=r"a holds a run. Go on with --resume, choose another --out"):
@@ -122,17 +137,19 @@ def test_a_gray_style_and_a_smaller_one(tmp_path: Path) -> None:
     assert torch.equal(picture[0], picture[1])
     small = train.style_picture(str(path), size=80)
     assert small.shape == (3, 48, 80)
-    light, kept = (Scene.from_rgb(p, illuminant="E").coefficients.mean() for p in (picture, small))
-    assert kept == pytest.approx(light, rel=0.01)  # filtered in linear light
+    light, kept = (float(Scene.from_rgb(p, illuminant="E").coefficients.mean()) for p in (picture, small))
+    assert kept == pytest.approx(light, rel=0.03)  # filtered in linear light; coded values lose 10 %
 
 
-def test_it_starts_from_a_saved_camera(tmp_path: Path, trained: Path) -> None:
+def test_it_starts_from_a_saved_camera(tmp_path: Path, trained: Path, monkeypatch) -> None:
+    without_pictures(monkeypatch)
     out = tmp_path / "again.safetensors"
     result, _ = run(out, camera=str(trained), steps=1)
     assert any(type(stage).__name__ == "StyleStage" for stage in result.camera)
 
 
-def test_threads_are_put_back(tmp_path: Path) -> None:
+def test_threads_are_put_back(tmp_path: Path, monkeypatch) -> None:
+    without_pictures(monkeypatch)
     before = torch.get_num_threads()
     run(tmp_path / "a.safetensors", threads=1, steps=1)
     assert torch.get_num_threads() == before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -51,10 +52,8 @@ class BuiltinScenes:
         for name in names:
             if name not in PHOTOGRAPHS:
                 raise ValueError(f"no built-in photograph {name!r}. There are: {', '.join(PHOTOGRAPHS)}.")
-            whole = Scene.builtin(name).with_depth(DISTANCE)
-            longest = max(whole.shape[1:])
             for scale in SCALES:
-                scene = whole.resized(round(longest * scale))
+                scene = _photograph(name, scale)
                 if 1 <= size <= min(scene.shape[1:]):
                     self.scenes.append((f"{name} at {scale:g}", scene))
         if not self.scenes:
@@ -81,6 +80,12 @@ class BuiltinScenes:
             origins.append(f"{name}, row {top}, column {left}")
         _, first = self.scenes[0]
         return Scene(torch.cat(planes), first.spectra, first.wavelengths, DISTANCE, first.illuminant), origins
+
+
+@functools.lru_cache(maxsize=32)
+def _photograph(name: str, scale: float) -> Scene:
+    whole = Scene.builtin(name).with_depth(DISTANCE)
+    return whole.resized(round(max(whole.shape[1:]) * scale))
 
 
 class PatchScenes:

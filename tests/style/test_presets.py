@@ -207,7 +207,7 @@ def test_the_thesis_is_table_4_1() -> None:
     assert len(Context().wavelengths) == 28
     assert imaging.bands is None  # a PSF for each of the 28 bands
     assert camera[1].coefficients.shape == (28, 28, 12)
-    assert preset.loss == {"statistic": "gram", "colour": 0.0, "content": 0.0, "l2": 1.0}
+    assert preset.loss == {"statistic": "gram", "colour": 0.0, "content": 0.0, "l2": 300.0}
 
 
 def test_the_thesis_has_a_plain_adam() -> None:

@@ -62,7 +62,7 @@ def test_the_loss_falls_and_every_part_learns() -> None:
     before = {name: value.clone() for name, value in camera.state_dict().items()}
     trained = fit(camera, tiny.loss(), source=tiny.source(), settings=tiny.settings(steps=40))
     curve = trained.history[:, 0]
-    assert curve[-10:].mean() < 0.8 * curve[:5].mean()  # measured: 0.6
+    assert curve[-10:].mean() < 0.85 * curve[:5].mean()
     for part, named in trained_parameters(camera, tiny.settings()).items():
         moved = [float((camera.state_dict()[name] - before[name]).abs().max()) for name, _ in named]
         assert max(moved) > 1e-4, part
