@@ -90,7 +90,7 @@ class Arm:
 OURS = ("optics", "filter", "convolution", "stage")
 QUICK = PRESETS["quick"]
 RATES = QUICK.settings.rates
-CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS)
+CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS, content_aim=None)
 THESIS_LOSS = PRESETS["thesis"].loss
 THESIS = replace(
     PRESETS["thesis"].settings,

@@ -104,7 +104,7 @@ class StyleStage(Stage):
         *,
         width: int = 16,
         dilations: Sequence[int] = (1, 2, 4, 8),
-        noise: tuple[int, int, int] = (0, 8, 8),
+        noise: tuple[int, int, int] = (0, 4, 8),
         level: float = 1.0,
     ) -> None:
         super().__init__()

@@ -100,6 +100,8 @@ class Preset:
         return settings
 
 
+AIM = 0.16
+"""Content loss at which faces are still there, and strokes too."""
 PAINTED: dict[str, Any] = {"colour": 0.7, "content": 0.5, "levels": (2, 4), "window": 15}
 """Contents are measured from half the size on, which leaves room for strokes."""
 
@@ -108,13 +110,13 @@ PRESETS: dict[str, Preset] = {
         "built-in scenes, 128 pixels: minutes on a laptop",
         style_camera,
         PAINTED,
-        Settings(steps=600),
+        Settings(steps=550, content_aim=AIM),
     ),
     "standard": Preset(
         "256 pixels, more steps: half an hour on a CPU, a minute on a GPU",
         style_camera,
         PAINTED,
-        Settings(steps=1000, size=256),
+        Settings(steps=1000, size=256, content_aim=AIM),
     ),
     "thesis": Preset(
         "the thesis's network and settings, its table 4.1: batch 2, 50 epochs, Adam",

@@ -39,6 +39,8 @@ NOISE_STREAM = 2**40  # streams of the camera's noise lie beyond those of the sc
 DIVERGED = 10.0  # times the median of the last losses
 MEMORY = 50  # losses
 LOOK = 20  # steps between looks at the pictures
+AIMED_FROM = 50  # steps: before, there is more scene than style in any picture
+AIM_GAIN, AIM_MEMORY, AIM_RANGE = 0.02, 0.95, 8.0
 MOST_RETURNS = 3
 CLIPPED, NEGATIVE, DEAD = 0.1, 0.3, 0.05
 
@@ -62,6 +64,8 @@ class Settings:
     clip: largest norm of the gradient; inf for any.
     average: of the weights, that is what is exported: share of the past, 0 for the last weights as they are.
     every: steps between checkpoints.
+    content_aim: None leaves the content term at its weight; else its weight follows, within a factor of 8, so that the
+        content loss itself settles here: strong strokes and faint ones then leave as much of the scene.
     tolerance: None trains through the reference physics; else through a plan for the training scenes, which is frozen
         between checkpoints and made anew where it is measured to miss the tolerance: see `kcam.Plan`.
     """
@@ -81,6 +85,7 @@ class Settings:
     clip: float = 1.0
     average: float = 0.99
     every: int = 100
+    content_aim: float | None = None
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
@@ -92,6 +97,8 @@ class Settings:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
         if not all(0 <= rate < math.inf for rate in self.rates.values()):
             raise ValueError(f"learning rates must be finite and >= 0, got {self.rates}.")
+        if self.content_aim is not None and not 0 < self.content_aim < 2:
+            raise ValueError(f"content_aim must be within 0..2, got {self.content_aim:g}. Use 0.16 or None.")
         if not self.clip > 0 or not 0 <= self.average < 1:
             raise ValueError(f"expected clip > 0 and 0 <= average < 1, got {self.clip:g} and {self.average:g}.")
 
@@ -285,6 +292,7 @@ class _Run:
         self.checkpoints = Checkpoints(folder) if folder is not None and self.leads else None
         self.average = {name: p.detach().clone() for name, p in self.named.items()}
         self.step, self.returns, self.slower = 0, 0, 1.0
+        self.emphasis, self.lost = 1.0, 0.0  # factor of the content's weight, and the content loss of late
         self.names: tuple[str, ...] = ()
         self.history: list[list[float]] = []
         self.advice: list[str] = []
@@ -315,6 +323,8 @@ class _Run:
         generators = [torch_generator(settings.seed, self.step, stream=own, device=device) for own in streams]
         self.clock.mark("scenes")
         terms, picture = self.engine(scene, generators, self.step, self.clock.mark)
+        if "content" in terms:
+            terms["content"] = terms["content"] * self.emphasis
         total = torch.stack(list(terms.values())).sum()
         self.optimiser.zero_grad()
         total.backward()
@@ -336,9 +346,22 @@ class _Run:
             for name, p in self.named.items():
                 self.average[name].lerp_(p, 1 - past)
         self.history.append(values)
+        self._aim()
         self.clock.mark("update")
         if self.step % LOOK == 0:
             self._look(picture.detach(), scene)
+
+    def _aim(self) -> None:
+        """Move the content's weight towards what makes its loss the one that is aimed at."""
+        aim = self.settings.content_aim
+        if aim is None or "content" not in self.names:
+            return
+        now = self.terms()["content"] / (self.emphasis * self.loss.weights["content"])
+        past = AIM_MEMORY if self.step > 1 else 0.0
+        self.lost = past * self.lost + (1 - past) * now
+        if self.step > AIMED_FROM and self.lost > 0:
+            moved = self.emphasis * (self.lost / aim) ** AIM_GAIN
+            self.emphasis = min(AIM_RANGE, max(1 / AIM_RANGE, moved))
 
     def _what_is_wrong(self, values: list[float], norm: float) -> str | None:
         for name, value in zip(self.names, values, strict=True):
@@ -426,6 +449,8 @@ class _Run:
             "step": self.step,
             "returns": self.returns,
             "slower": self.slower,
+            "emphasis": self.emphasis,
+            "lost": self.lost,
             "names": list(self.names),
             "advice": self.advice,
             "optimiser": groups,
@@ -487,6 +512,7 @@ class _Run:
             self.average[name].copy_(value)
         load_optimiser_state(self.optimiser, self._by_parameter(), tensors, document["optimiser"])
         self.step, self.returns, self.slower = document["step"], document["returns"], document["slower"]
+        self.emphasis, self.lost = document["emphasis"], document["lost"]
         self.names, self.advice = tuple(document["names"]), list(document["advice"])
         self.history = tensors["history"].tolist()
         self.plan = None if document["plan"] is None else Plan.from_json(document["plan"])

@@ -461,4 +461,4 @@ def test_a_float64_scene_gives_a_float64_picture(scene: Scene) -> None:
 
 
 def test_it_stands_behind_the_tone_curve_and_says_what_it_is() -> None:
-    assert "width=16, dilations=(1, 2, 4, 8), noise=(0, 8, 8), level=1" in repr(isp.StyleStage())
+    assert "width=16, dilations=(1, 2, 4, 8), noise=(0, 4, 8), level=1" in repr(isp.StyleStage())

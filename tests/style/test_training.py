@@ -175,6 +175,22 @@ def test_a_diverging_loss_goes_back(monkeypatch) -> None:
     assert trained.finished
 
 
+def test_the_content_weight_follows_its_aim(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("kcam.style.training.AIMED_FROM", 2)
+
+    def content(aim: float | None, **how) -> Tensor:
+        return train(how.pop("folder", None), content_aim=aim, **how).history[:, 3]
+
+    plain, strict, loose = content(None), content(1e-4), content(1.9)
+    assert torch.equal(plain[:3], strict[:3])
+    assert strict[-1] > 1.1 * plain[-1]  # weighted: the factor grows where more is lost than aimed at
+    assert loose[-1] < 0.95 * plain[-1]
+    content(1e-4, folder=tmp_path, stop_after=5)
+    assert torch.equal(content(1e-4, folder=tmp_path, resume=True), strict)
+    with pytest.raises(ValueError, match=r"content_aim must be within 0..2, got 3"):
+        Settings(content_aim=3.0)
+
+
 def test_weights_are_averaged() -> None:
     camera = tiny.camera(stage=False)
     how = {"source": tiny.source(), "settings": tiny.settings(steps=6, average=0.0)}
