@@ -293,13 +293,14 @@ def paint_pictures() -> None:
 
 def save_jpeg(figure: Any, path: Path, *, largest: int = 600_000) -> None:
     """As docs/generate.py does, which cannot be imported before it has read the results."""
-    content = io.BytesIO()
-    figure.savefig(content, dpi=130, facecolor="white", format="png")
-    picture = Image.open(content).convert("RGB")
-    for quality in (90, 84, 78, 70):
-        picture.save(path, quality=quality, subsampling=0, optimize=True)
-        if path.stat().st_size < largest:
-            return
+    for resolution in (110, 90, 75, 60):  # strokes and noise are bulky
+        content = io.BytesIO()
+        figure.savefig(content, dpi=resolution, facecolor="white", format="png")
+        picture = Image.open(content).convert("RGB")
+        for quality in (88, 80, 72):
+            picture.save(path, quality=quality, optimize=True)
+            if path.stat().st_size < largest:
+                return
 
 
 if __name__ == "__main__":
