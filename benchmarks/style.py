@@ -248,7 +248,7 @@ def collect(work: Path) -> None:
     hopper = next(iter(photographs))
     sheets = {
         "style": plots.contact_sheet(
-            [[halves(style)[0], *(shot(style, "stage", name) for name in photographs)] for style in STYLES],
+            [[halves(style)[0][:, :SIZE], *(shot(style, "stage", name) for name in photographs)] for style in STYLES],
             titles=["Style", *(f"A shot: {name}" for name in photographs)],
             labels=[f"kcam train {style}" for style in STYLES],
         ),
@@ -282,7 +282,7 @@ def paint_pictures() -> None:
         own, _ = halves(style)
         texture = paint(StyleLoss(own, content=0.0, colour=1.0), shape=(SIZE, SIZE), steps=PAINT_STEPS)
         painted = paint(StyleLoss(own, content=0.3, colour=1.0), photo=photograph, steps=PAINT_STEPS)
-        rows.append([own, texture, painted])
+        rows.append([own[:, :SIZE], texture, painted])
     sheet = plots.contact_sheet(
         rows,
         titles=["Style", "Texture, from white noise", "Painting, from the photo"],
