@@ -146,8 +146,7 @@ def style_loss(sizes: Sizes) -> StyleLoss:
 
 def kcam_picture(camera: Camera, scene: Scene) -> Picture:
     """As `kcam.style.training.Step` takes it."""
-    generators = [torch.Generator() for _ in range(scene.shape[0])]
-    picture, recorded = photograph(camera, scene, generators, recorded=True)
+    picture, recorded = photograph(camera, scene, lambda row, stage: torch.Generator(), recorded=True)
     assert recorded is not None
     return picture, recorded
 

@@ -26,15 +26,16 @@ DARKEST = 0.03
 
 
 class _Conv(nn.Conv2d):
-    """A convolution that continues the picture by its border."""
+    """A convolution that continues the picture by its border.
 
-    bias: nn.Parameter
+    Before a normalisation it has no bias, which would cancel: its gradient is rounding, of which Adam makes full steps.
+    """
 
-    def __init__(self, channels: int, out: int, side: int, *, stride: int = 1, dilation: int = 1) -> None:
-        border = dilation * (side // 2)
-        super().__init__(
-            channels, out, side, stride=stride, dilation=dilation, padding=border, padding_mode="replicate"
-        )
+    def __init__(
+        self, channels: int, out: int, side: int, *, stride: int = 1, dilation: int = 1, bias: bool = False
+    ) -> None:
+        border = {"padding": dilation * (side // 2), "padding_mode": "replicate"}
+        super().__init__(channels, out, side, stride=stride, dilation=dilation, bias=bias, **border)  # type: ignore[arg-type]
 
     def reset_parameters(self) -> None:
         """Nothing: torch's would draw from the global generator, and the stage sets them."""
@@ -121,11 +122,11 @@ class StyleStage(Stage):
         self.enter, self.enter_norm = _Conv(3 + noise[0] + 2 * noise[1], width, 5), _Norm(width)
         self.down1, self.down1_norm = _Conv(width, half, 3, stride=2), _Norm(half)
         self.down2, self.down2_norm = _Conv(half, quarter, 3, stride=2), _Norm(quarter)
-        self.mix = _Conv(quarter + noise[2], quarter, 1)
+        self.mix = _Conv(quarter + noise[2], quarter, 1, bias=True)
         self.blocks = nn.ModuleList(_Residual(quarter, dilation) for dilation in self.dilations)
         self.up1, self.up1_norm = _Conv(quarter, half, 3), _Norm(half)
         self.up2, self.up2_norm = _Conv(half, width, 3), _Norm(width)
-        self.leave = _Conv(2 * width, 3, 5)
+        self.leave = _Conv(2 * width, 3, 5, bias=True)
         self.colour = nn.Parameter(torch.eye(3))
         self._start()
 
@@ -138,7 +139,8 @@ class StyleStage(Stage):
                 nn.init.kaiming_uniform_(start, a=math.sqrt(5), generator=seeded)
                 with torch.no_grad():
                     layer.weight.copy_(start)
-                    layer.bias.zero_()
+                    if layer.bias is not None:
+                        layer.bias.zero_()
         nn.init.zeros_(self.leave.weight)
 
     @property

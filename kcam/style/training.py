@@ -8,7 +8,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from kcam import isp, optics, sensor
 from kcam.camera import DEMOSAICING, Camera
+from kcam.context import Stage
 from kcam.planner import Plan
 from kcam.scene import Scene
 from kcam.style.checkpoints import Checkpoints
@@ -35,7 +36,8 @@ PARTS: dict[str, tuple[type[nn.Module], ...]] = {
 }
 """What can train, and the stages that hold it."""
 
-NOISE_STREAM = 2**40  # streams of the camera's noise lie beyond those of the scenes, one per row each
+NOISE_STREAM = 2**40  # streams of the camera's noise lie beyond those of the scenes: one for each row and stage
+MOST_STAGES = 2**10
 DIVERGED = 10.0  # times the median of the last losses
 MEMORY = 50  # losses
 LOOK = 20  # steps between looks at the pictures
@@ -158,6 +160,10 @@ def trained_parameters(camera: Camera, settings: Settings) -> dict[str, list[tup
     return found
 
 
+Generators = Callable[[int, int], torch.Generator]
+"""The generator of a row of the batch and a stage."""
+
+
 class Step(nn.Module):
     """A training step as one module: scenes to the terms of the loss; what torch's data parallel engine wraps."""
 
@@ -167,10 +173,10 @@ class Step(nn.Module):
         self.through: Camera = camera
 
     def forward(
-        self, scene: Scene, generators: Sequence[torch.Generator], turn: int, mark: Callable[[str], None]
+        self, scene: Scene, generator: Generators, turn: int, mark: Callable[[str], None]
     ) -> tuple[dict[str, Tensor], Tensor]:
         """The terms, and the pictures (B,3,H,W)."""
-        picture, recorded = photograph(self.through, scene, generators, recorded=bool(self.loss.weights["l2"]))
+        picture, recorded = photograph(self.through, scene, generator, recorded=bool(self.loss.weights["l2"]))
         mark("camera")
         shown = scene.to_srgb()
         terms = self.loss.terms(picture, shown, recorded=recorded, turn=turn)
@@ -179,18 +185,26 @@ class Step(nn.Module):
 
 
 def photograph(
-    camera: Camera, scene: Scene, generators: Sequence[torch.Generator], *, recorded: bool = False
+    camera: Camera, scene: Scene, generator: Generators, *, recorded: bool = False
 ) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
-    """Pictures of a batch with a generator for each row, so that a row's noise does not depend on its neighbours.
+    """Pictures of a batch with a generator for each row and stage: no noise depends on a neighbour's or an earlier one.
+
+    An earlier one would: a Poisson draw takes as many numbers as it needs, which rounding can change.
 
     Returns:   the pictures, and with `recorded` what the sensor records with and without optics, before any noise:
                the two sides of the thesis's L2 content loss (its figure 4.1).
     """
     split = next((i for i, stage in enumerate(camera) if isinstance(stage, DEMOSAICING) or _is_random(stage)), 0)
     context = camera.resolve(scene)
-    front, back = Camera(*camera.stages[:split], context=context), Camera(*camera.stages[split:], context=context)
+    front = Camera(*camera.stages[:split], context=context)
     light = front(scene)
-    rows = [back(row[None], generator=own) for row, own in zip(light, generators, strict=True)]
+    rows = []
+    for number, row in enumerate(light):
+        signal = row[None]
+        for index, stage in enumerate(camera.stages[split:]):
+            own = dataclasses.replace(context, generator=generator(number, index))
+            signal = stage(signal, own) if isinstance(stage, Stage) else stage(signal)
+        rows.append(signal)
     pair = None
     if recorded:
         with torch.no_grad():
@@ -219,7 +233,8 @@ def fit(
 
     What is random is drawn by seed and step, so that a run that was killed goes on from its last checkpoint with the
     same weights, bit for bit, on the same machine, torch and number of threads. Under torchrun each process takes its
-    rows of the batch, and torch's DistributedDataParallel averages their gradients.
+    rows of the batch, and torch's DistributedDataParallel averages their gradients: the curve is that of one process up
+    to rounding, which training makes grow, and until a Poisson draw of the shot noise falls the other way.
 
     Args:      camera: trains in place; its nn.Parameters in the parts with a learning rate.
                loss: the style.
@@ -319,10 +334,13 @@ class _Run:
         scene = scene.to(device=device)
         if settings.tolerance is not None and self.plan is None:
             self._make_plan()
-        streams = [NOISE_STREAM + row for row in rows]
-        generators = [torch_generator(settings.seed, self.step, stream=own, device=device) for own in streams]
+
+        def generator(number: int, stage: int) -> torch.Generator:
+            stream = NOISE_STREAM + MOST_STAGES * rows[number] + stage
+            return torch_generator(settings.seed, self.step, stream=stream, device=device)
+
         self.clock.mark("scenes")
-        terms, picture = self.engine(scene, generators, self.step, self.clock.mark)
+        terms, picture = self.engine(scene, generator, self.step, self.clock.mark)
         if "content" in terms:
             terms["content"] = terms["content"] * self.emphasis
         total = torch.stack(list(terms.values())).sum()

@@ -14,7 +14,7 @@ from kcam.units import mm, nm, um
 SIZE = 64
 
 
-def camera(*, stage: bool = True) -> Camera:
+def camera(*, stage: bool = True, shot_noise: bool = True) -> Camera:
     """All parts that train, each as small as it gets."""
     lens = optics.Lens(
         optics.CircularAperture(diameter=5 * mm),
@@ -27,7 +27,7 @@ def camera(*, stage: bool = True) -> Camera:
         sensor.ColourFilter.kodak(infrared_cut=680 * nm).trainable(),
         sensor.Mosaic("RGGB"),
         sensor.Exposure(),
-        sensor.ShotNoise(full_well=10_000),
+        *([sensor.ShotNoise(full_well=10_000)] if shot_noise else []),
         sensor.ADC(bits=12),
         isp.Demosaic("bilinear"),
         isp.Convolution(),

@@ -19,7 +19,7 @@ def main() -> None:
     if distributed:
         torch.distributed.init_process_group("gloo")
     trained = fit(
-        tiny.camera(),
+        tiny.camera(shot_noise="--no-shot-noise" not in sys.argv),
         tiny.loss(),
         source=tiny.source(),
         settings=tiny.settings(steps=30, every=2),
