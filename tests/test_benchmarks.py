@@ -290,6 +290,7 @@ def test_a_finely_sampled_textbook_comes_to_the_loss_of_a_step(step):
     assert as_timed["loss"] > 5 * finer["loss"]  # measured 1.3e-3: what is timed is the coarser one
 
 
+@pytest.mark.slow
 def test_a_step_is_raced_in_parts_and_whole(tmp_path):
     assert style_step.main(["--quick", "--out", str(tmp_path / "step.json")]) == 0
     content = json.loads((tmp_path / "step.json").read_text())

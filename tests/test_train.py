@@ -88,6 +88,7 @@ def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) 
     assert out.read_bytes() == trained.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None:
     without_pictures(monkeypatch)
     out = tmp_path / "a.safetensors"
@@ -141,6 +142,7 @@ def test_a_gray_style_and_a_smaller_one(tmp_path: Path) -> None:
     assert kept == pytest.approx(light, rel=0.03)  # filtered in linear light; coded values lose 10 %
 
 
+@pytest.mark.slow
 def test_it_starts_from_a_saved_camera(tmp_path: Path, trained: Path, monkeypatch) -> None:
     without_pictures(monkeypatch)
     out = tmp_path / "again.safetensors"
@@ -148,6 +150,7 @@ def test_it_starts_from_a_saved_camera(tmp_path: Path, trained: Path, monkeypatc
     assert any(type(stage).__name__ == "StyleStage" for stage in result.camera)
 
 
+@pytest.mark.slow
 def test_threads_are_put_back(tmp_path: Path, monkeypatch) -> None:
     without_pictures(monkeypatch)
     before = torch.get_num_threads()

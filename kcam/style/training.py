@@ -207,9 +207,9 @@ def photograph(
         rows.append(signal)
     pair = None
     if recorded:
-        with torch.no_grad():
-            flat = Camera(*(stage for stage in front if not isinstance(stage, optics.Imaging)), context=context)
-        pair = (light, flat(scene.bands()))
+        flat = Camera(*(stage for stage in front if not isinstance(stage, optics.Imaging)), context=context)
+        with torch.no_grad():  # a target: it does not move towards the picture
+            pair = (light, flat(scene.bands()))
     return torch.cat(rows), pair
 
 

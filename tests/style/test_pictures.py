@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from kcam.style.pictures import STYLES, painting
 
-NAMES = list(STYLES)
+NAMES = [name if name == "strokes" else pytest.param(name, marks=pytest.mark.slow) for name in STYLES]  # seconds each
 
 
 @pytest.fixture(scope="module")

@@ -57,6 +57,7 @@ def same(trained, straight) -> bool:
     return torch.equal(trained.history, history) and all(torch.equal(state[name], weights[name]) for name in weights)
 
 
+@pytest.mark.filterwarnings("ignore::kcam.style.StyleWarning")  # it may well look like a negative for a while
 def test_the_loss_falls_and_every_part_learns() -> None:
     camera = tiny.camera()
     before = {name: value.clone() for name, value in camera.state_dict().items()}
@@ -222,6 +223,8 @@ def test_recorded_is_what_the_sensor_sees_with_and_without_optics() -> None:
     _, pair = photograph(camera, scene, lambda row, stage: torch.Generator(), recorded=True)
     assert pair is not None
     assert torch.allclose(*pair, atol=1e-5)
+    assert pair[0].requires_grad
+    assert not pair[1].requires_grad  # the target
     _, pair = photograph(tiny.camera(), scene, lambda row, stage: torch.Generator(), recorded=True)
     assert (pair[0] - pair[1]).abs().max() > 1e-3
 
