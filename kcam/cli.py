@@ -6,6 +6,7 @@ Only here are quantities strings with units.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -375,15 +376,22 @@ def train(
             seed=seed,
             device=device,
         )
+        leads = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun starts, one speaks
         with training_progress() as advance:
-            trained = module.run(options, resume=resume, threads=threads or None, advance=advance, say=err.print)
-        if profile:
+            trained = module.run(
+                options,
+                resume=resume,
+                threads=threads or None,
+                advance=advance if leads else None,
+                say=err.print if leads else lambda text: None,
+            )
+        if profile and leads:
             done = sum(trained.profile.values())
             for part, seconds in trained.profile.items():
                 typer.echo(f"{part:10} {seconds / max(1, trained.steps_timed):8.3f} s a step  {seconds / done:4.0%}")
-        if trained.finished:
+        if trained.finished and leads:
             typer.echo(f"{out}\n{out.with_suffix('')}/report.html")
-        else:
+        if not trained.finished:
             raise typer.Exit(3)
 
 
