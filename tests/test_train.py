@@ -17,7 +17,7 @@ from kcam.cli import app, duration
 from kcam.scene import Scene
 from kcam.style import painting
 
-SMALL = {"steps": 3, "size": 64, "batch": 1}
+CHOSEN = {"stage": False, "steps": 3, "size": 64, "batch": 1}
 
 
 def invoke(command: str):
@@ -31,15 +31,17 @@ def without_pictures(monkeypatch) -> None:
 
 def run(out: Path, *, resume: bool = False, threads: int | None = 1, advance=None, **changes):
     lines: list[str] = []
-    chosen = {"style": "strokes", "out": str(out), "stage": False} | SMALL | changes
-    options = train.Options(**chosen)
+    options = train.Options(**CHOSEN | {"out": str(out)} | changes)
     return train.run(options, resume=resume, threads=threads, advance=advance, say=lines.append), lines
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small_sheets():
-    """One small scene on the contact sheets, which are drawn at every checkpoint."""
+def small_ones(tmp_path_factory):
+    """A style that is quickly painted, and one small scene on the contact sheets, which every checkpoint draws."""
+    path = tmp_path_factory.mktemp("style") / "style.png"
+    plots.write_picture(painting("woodcut", size=128), path)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(CHOSEN, "style", str(path))
         patch.setattr(train, "SHOWN", ("coffee",))
         patch.setattr(train, "SHOWN_SIZE", 48)
         yield
@@ -58,7 +60,7 @@ def test_it_writes_a_camera_and_a_report(trained: Path) -> None:
         "checkpoints", "config.json", "sheet.png", "loss.png", "report.html"
     }  # fmt: skip
     configuration = json.loads((folder / "config.json").read_text())
-    assert configuration["options"]["style"] == "strokes"
+    assert configuration["options"]["style"] == CHOSEN["style"]
     assert configuration["settings"]["steps"] == 3
     assert configuration["threads"] == 1
     assert "http" not in (folder / "report.html").read_text().replace("http-equiv", "")
@@ -115,7 +117,7 @@ def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None
         ({"features": "resnet"}, r'unknown features "resnet"; there are: steerable, vgg16'),
         ({"features": "vgg16"}, r"needs --vgg-weights: the path of torchvision's vgg16-397923af.pth"),
         ({"vgg_weights": "w.pth"}, r"--vgg-weights are for --features vgg16"),
-        ({"style_size": 4096}, r"style size 4096 is not within 1..512"),
+        ({"style_size": 4096}, r"style size 4096 is not within 1..128"),
         ({"style_size": 32}, r"a style of 32 x 32 is too small"),
         ({"patches": "nowhere"}, r"nowhere"),
         ({"camera": "nothing.safetensors"}, r"there is no file nothing.safetensors"),
@@ -162,7 +164,7 @@ def test_threads_are_put_back(tmp_path: Path, monkeypatch) -> None:
 
 def test_train_shoot_and_paint_as_commands(tmp_path: Path, trained: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    command = "train strokes --steps 1 --size 64 --batch 1 --no-stage --threads 1 --profile --out a.safetensors"
+    command = "train woodcut --steps 1 --size 64 --batch 1 --no-stage --threads 1 --profile --out a.safetensors"
     result = invoke(command)
     assert result.exit_code == 0, result.output
     assert "a.safetensors\na/report.html" in result.output

@@ -162,6 +162,7 @@ def test_blind_to_place_not_to_texture(name: str):
     assert score(noise(3, 256, 256)) > 50 * other
 
 
+@pytest.mark.slow
 def test_textures_are_told_apart():
     """Gray, of equal mean and contrast: what is left is texture. Measured: AUC .988 and 1-NN 1.00."""
     textures = [torch.tensor(getattr(data, name)()).float() for name in ("brick", "grass", "gravel")]
