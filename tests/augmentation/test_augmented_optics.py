@@ -245,7 +245,7 @@ class TestAberration:
         worst = np.linalg.svd(slopes.transpose(2, 0, 1), compute_uv=False)[:, 0].max()  # over all unit vectors
         assert worst == pytest.approx(augmentation.slope(PRIMARIES, radius=1.0), rel=0.05)
 
-    @pytest.mark.parametrize("rms", [0.5, 2.0])
+    @pytest.mark.parametrize("rms", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
     def test_the_window_leaves_out_little_light(self, rms: float) -> None:
         augmentation = KC.RandomAberration(p=1.0, rms=rms, f_number=4.0, wavelengths=[550 * nm])
         _, drawn = augmented(augmentation, picture(20, 1, 3, 3))

@@ -84,6 +84,7 @@ def test_the_angular_spectrum_is_the_benchmarks_baseline() -> None:
     assert l1(ours, theirs) < 1e-7  # 1e-16 of 1e7 radians, and some more by cancellation
 
 
+@pytest.mark.slow
 def test_the_textbook_converges_on_the_fresnel_psf() -> None:
     asked = query(lens(), distances=[1.0, 2.0])
     truth = choose(asked, propagator="fresnel")(asked)

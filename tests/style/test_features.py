@@ -103,6 +103,7 @@ def test_type_follows_the_picture(features: SteerableFeatures, dtype: torch.dtyp
         assert (layer.dtype, layer.device.type) == (dtype, device.type), name
 
 
+@pytest.mark.slow
 def test_natural_is_that_of_the_builtin_photographs(features: SteerableFeatures):
     """A floor's scale: within a factor of 1.5 of the mean over the four, which differ among them by 3 to 7."""
     variances: dict[str, list[Tensor]] = {}

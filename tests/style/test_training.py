@@ -61,14 +61,14 @@ def same(trained, straight) -> bool:
 def test_the_loss_falls_and_every_part_learns() -> None:
     camera = tiny.camera()
     before = {name: value.clone() for name, value in camera.state_dict().items()}
-    trained = fit(camera, tiny.loss(), source=tiny.source(), settings=tiny.settings(steps=40))
+    trained = fit(camera, tiny.loss(), source=tiny.source(), settings=tiny.settings(steps=24))
     curve = trained.history[:, 0]
-    assert curve[-10:].mean() < 0.85 * curve[:5].mean()
+    assert curve[-6:].mean() < 0.9 * curve[:5].mean()
     for part, named in trained_parameters(camera, tiny.settings()).items():
         moved = [float((camera.state_dict()[name] - before[name]).abs().max()) for name, _ in named]
         assert max(moved) > 1e-4, part
     assert trained.finished
-    assert trained.steps_timed == 40
+    assert trained.steps_timed == 24
     assert set(trained.profile) == {"scenes", "camera", "loss", "gradient", "update"}
     assert trained.names == ("total", "style", "colour", "content")
     assert torch.allclose(trained.history[:, 0], trained.history[:, 1:].sum(1), rtol=1e-5)
