@@ -142,7 +142,7 @@ ARMS: dict[str, Arm] = {
 
 
 def halves(style: str) -> tuple[Tensor, Tensor]:
-    """What is trained on, and the other crop of the style, 256 x 256 each."""
+    """What is trained on, 512 x 256, and the other crop of the style, 256 x 256."""
     whole = painting(style, size=2 * HALF)
     return whole[:, :, :HALF], whole[:, :HALF, HALF:]
 
@@ -178,7 +178,7 @@ def gaps(pictures: dict[str, Tensor], *, style: str) -> dict[str, Any]:
 
 
 def run(style: str, name: str, work: Path) -> dict[str, Any]:
-    """Train an arm, write its camera and pictures, and measure."""
+    """Train an arm, write its pictures, and measure."""
     arm = ARMS[name]
     own, _ = halves(style)
     camera = arm.camera()
@@ -294,9 +294,8 @@ def paint_pictures() -> None:
 def save_jpeg(figure: Any, path: Path, *, largest: int = 600_000) -> None:
     """As docs/generate.py does, which cannot be imported before it has read the results."""
     for resolution in (110, 90, 75, 60):  # strokes and noise are bulky
-        content = io.BytesIO()
-        figure.savefig(content, dpi=resolution, facecolor="white", format="png")
-        picture = Image.open(content).convert("RGB")
+        content = plots.figure_bytes(figure, resolution=resolution)
+        picture = Image.open(io.BytesIO(content)).convert("RGB")
         for quality in (88, 80, 72):
             picture.save(path, quality=quality, optimize=True)
             if path.stat().st_size < largest:

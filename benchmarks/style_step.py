@@ -32,6 +32,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from benchmarks.baselines import doe_scale, per_band_render, textbook_psf_bank
+from benchmarks.bench import Sizes as BenchSizes
 from benchmarks.bench import gradient_error, print_verdicts, random_phase, relative_max
 from benchmarks.common import ROOT, Contestant, environment, print_table, race, write_json
 from kcam import optics, spectral
@@ -57,22 +58,15 @@ Picture = tuple[Tensor, tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """How large the work is, and how long each race may take [s]."""
+class Sizes(BenchSizes):
+    """As in `bench`, with a batch of the pictures that are trained on."""
 
-    bands: int = 28
-    window: int = 297
-    pupil: int = 891
     picture: int = 256
-    batch: int = 2
     seconds: float = 40.0
+    batch: int = 2
 
     @property
-    def wavelengths(self) -> Tensor:
-        return torch.linspace(420, 720, self.bands, dtype=DOUBLE) * nm
-
-    @property
-    def sample(self) -> Tensor:
+    def members(self) -> Tensor:
         """Every seventh band, as in `bench`: with gradients, 2 x 2 samples a pixel of all 28 would take 15 GB."""
         return torch.arange(self.bands // 2 % 7, self.bands, 7)
 
@@ -327,7 +321,7 @@ class Bench:
         contestants = []
         camera = self.cameras[True]
         for who, how in self.textbooks(pixels=pixels).items():
-            members = self.sizes.sample if pixels else None
+            members = self.sizes.members if pixels else None
             timed = Textbook(camera, self.sizes, members=members, **how)
             full = Textbook(camera, self.sizes, spared=True, **how)
             share = len(timed.members) / self.sizes.bands

@@ -798,9 +798,8 @@ def augmentation_gallery(path: Path) -> None:
 
 def save_jpeg(figure: Any, path: Path, *, resolution: float = 200, largest: int = 400_000) -> None:
     """A figure as a JPEG of at most `largest` bytes, with its colours at full resolution."""
-    content = io.BytesIO()
-    figure.savefig(content, dpi=resolution, facecolor="white", format="png")
-    picture = Image.open(content).convert("RGB")
+    content = plots.figure_bytes(figure, resolution=resolution)
+    picture = Image.open(io.BytesIO(content)).convert("RGB")
     for quality in (92, 88, 84, 80, 75, 70):
         picture.save(path, quality=quality, subsampling=0, optimize=True)
         if path.stat().st_size < largest:

@@ -291,9 +291,13 @@ def _check_order(stages: Sequence[nn.Module]) -> None:
         last, before = rank, name
 
 
+def is_random(stage: nn.Module) -> bool:
+    """Whether a stage draws noise, and so has a mean."""
+    return isinstance(stage, Stage) and callable(getattr(stage, "mean", None))
+
+
 def _at_mean(stage: Any) -> nn.Module:
-    random = isinstance(stage, Stage) and callable(getattr(stage, "mean", None))
-    return stage.mean() if random else stage
+    return stage.mean() if is_random(stage) else stage
 
 
 def _same(value: Any, other: Any) -> bool:

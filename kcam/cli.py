@@ -29,6 +29,11 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; without it, everything'
+FeaturesOption = Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")]
+WeightsOption = Annotated[str, typer.Option("--vgg-weights", help="torchvision's vgg16-397923af.pth")]
+StyleSizeOption = Annotated[
+    int, typer.Option("--style-size", min=0, help="shrink the style to this longer side [pixels]; 0: as it is")
+]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="of the noise")]
 CameraOption = Annotated[
     str, typer.Option("--camera", help="thesis, ideal, phone, singlet, or a file that Camera.save wrote")
@@ -336,11 +341,9 @@ def train(
     patches: Annotated[str, typer.Option("--patches", help="a patch store; without one, the built-in scenes")] = "",
     camera: Annotated[str, typer.Option("--camera", help="a saved camera to start from")] = "",
     stage: Annotated[bool, typer.Option("--stage/--no-stage", help="with a style stage, or the camera alone")] = True,
-    features: Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")] = "steerable",
-    vgg_weights: Annotated[str, typer.Option("--vgg-weights", help="torchvision's vgg16-397923af.pth")] = "",
-    style_size: Annotated[
-        int, typer.Option("--style-size", min=0, help="shrink the style to this longer side [pixels]; 0: as it is")
-    ] = 0,
+    features: FeaturesOption = "steerable",
+    vgg_weights: WeightsOption = "",
+    style_size: StyleSizeOption = 0,
     steps: Annotated[int, typer.Option("--steps", min=0, help="0: the preset's")] = 0,
     batch: Annotated[int, typer.Option("--batch", min=0, help="scenes per step; 0: the preset's")] = 0,
     size: Annotated[int, typer.Option("--size", min=0, help="of the crops [pixels]; 0: the preset's")] = 0,
@@ -404,7 +407,8 @@ def training_progress() -> Iterator[Callable[..., None]]:
         first: list[tuple[int, float]] = []
 
         def advance(progress: StepProgress, steps: int) -> None:
-            first.append((progress.step, progress.seconds)) if not first else None
+            if not first:
+                first.append((progress.step, progress.seconds))
             terms = "  ".join(f"{name} {value:.3f}" for name, value in progress.terms.items())
             bar.update(task, completed=progress.step, total=steps, description=f"step {progress.step}: {terms}")
             done = progress.step - first[0][0]
@@ -436,11 +440,9 @@ def paint(
     ] = "strokes",
     out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("painted.png"),
     start: Annotated[str, typer.Option("--start", help="photo, or noise: from what to paint")] = "",
-    features: Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")] = "steerable",
-    vgg_weights: Annotated[str, typer.Option("--vgg-weights", help="torchvision's vgg16-397923af.pth")] = "",
-    style_size: Annotated[
-        int, typer.Option("--style-size", min=0, help="shrink the style to this longer side [pixels]; 0: as it is")
-    ] = 0,
+    features: FeaturesOption = "steerable",
+    vgg_weights: WeightsOption = "",
+    style_size: StyleSizeOption = 0,
     size: Annotated[int, typer.Option("--size", min=64, help="longer side of the painting [pixels]")] = 512,
     steps: Annotated[int, typer.Option("--steps", min=1, help="of the optimiser")] = 200,
     content: Annotated[float, typer.Option("--content", min=0.0, help="weight of what the photo shows")] = 0.3,
@@ -449,7 +451,7 @@ def paint(
     """Paint a photograph in the manner of a style, or a texture of the style: the picture itself is optimised."""
     with one_line_errors():
         from kcam import plots, train
-        from kcam.scene import Scene, read_picture
+        from kcam.scene import read_picture
         from kcam.style import StyleLoss
         from kcam.style import paint as optimise
 
@@ -457,11 +459,7 @@ def paint(
         picture = train.style_picture(style, size=style_size or None)
         layers = train.style_features(features, vgg_weights or None)
         loss = StyleLoss(picture, features=layers, content=content if photo else 0.0, colour=1.0)
-        shown = None
-        if photo:
-            shown = read_picture(photo).expand(3, -1, -1)
-            if max(shown.shape[-2:]) > size:
-                shown = Scene.from_rgb(shown, illuminant="D65").resized(size).to_srgb()[0]
+        shown = train.shrunk(read_picture(photo).expand(3, -1, -1), size) if photo else None
         with progress("paint", total=steps) as advance:
             painted = optimise(
                 loss,

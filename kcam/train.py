@@ -19,8 +19,6 @@ from torch import Tensor
 from kcam import __version__, files, plots, report, style
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
-from kcam.style import StyleLoss
-from kcam.style.training import Trained
 
 SHOWN = ("astronaut", "coffee", "chelsea")
 SHOWN_SIZE = 192
@@ -67,11 +65,16 @@ def style_picture(name: str, *, size: int | None = None) -> Tensor:
     else:
         raise ValueError(f'unknown style "{name}": expected a picture file, or one of {", ".join(style.STYLES)}.')
     longest = max(picture.shape[-2:])
-    if size is None or size == longest:
-        return picture.contiguous()
-    if not 1 <= size <= longest:
+    if size is not None and not 1 <= size <= longest:
         raise ValueError(f"style size {size} is not within 1..{longest}, what the style has: strokes are not enlarged.")
-    return Scene.from_rgb(picture, illuminant="E").resized(size).to_srgb()[0]
+    return picture.contiguous() if size is None else shrunk(picture, size)
+
+
+def shrunk(picture: Tensor, size: int) -> Tensor:
+    """A picture (3,H,W) whose longer side has at most `size` pixels; colours are filtered in linear light."""
+    if max(picture.shape[-2:]) <= size:
+        return picture.contiguous()
+    return Scene.from_rgb(picture).resized(size).to_srgb()[0]
 
 
 def run(
@@ -81,7 +84,7 @@ def run(
     threads: int | None = None,
     advance: Callable[[style.Progress, int], None] | None = None,
     say: Callable[[str], None] = lambda text: None,
-) -> Trained:
+) -> style.Trained:
     """Train a camera, and write it, a contact sheet and the loss curve at every checkpoint, and a report at the end.
 
     Killed at any moment, a run with the same options and `resume` ends in the same camera, bit for bit. Ctrl-C and
@@ -125,11 +128,12 @@ def run(
             settled = document | {"settings": asdict(settings), "kcam": __version__, "torch": torch.__version__}
             files.replace(folder / "config.json", (json.dumps(settled, indent=1) + "\n").encode())
 
-        def show(camera: Camera, step: int, history: Tensor) -> dict[str, Any]:
-            return _show(camera, step, history, folder=folder, style=picture, scenes=scenes, start=start, loss=loss)
+        figures: dict[str, Any] = {}  # of the last checkpoint
 
-        def on_checkpoint(camera: Camera, step: int, history: Tensor) -> None:
-            show(camera, step, history)
+        def show(camera: Camera, step: int, history: Tensor) -> None:
+            figures.update(
+                _show(camera, step, history, folder=folder, picture=picture, scenes=scenes, start=start, loss=loss)
+            )
 
         with warnings.catch_warnings(), _stopping() as stopped:
             warnings.showwarning = lambda message, *_: say(str(message))  # type: ignore[assignment]
@@ -141,12 +145,13 @@ def run(
                 folder=folder / "checkpoints",
                 resume=resume,
                 advance=None if advance is None else lambda progress: advance(progress, settings.steps),
-                on_checkpoint=on_checkpoint,
+                on_checkpoint=show,
                 stop=stopped,
             )
         if leads and trained.finished:
+            if not figures:  # nothing was left to train
+                show(trained.camera, len(trained.history), trained.history)
             trained.camera.cpu().save(out)
-            figures = show(trained.camera, len(trained.history), trained.history)
             _write_report(folder / "report.html", options, settings, trained, figures)
         elif leads:
             say(f"stopped after {len(trained.history)} of {settings.steps} steps; go on with --resume")
@@ -159,15 +164,15 @@ def _show(
     history: Tensor,
     *,
     folder: Path,
-    style: Tensor,
+    picture: Tensor,
     scenes: Sequence[Scene],
     start: Camera,
-    loss: StyleLoss,
+    loss: style.StyleLoss,
 ) -> dict[str, Any]:
     """Draw the contact sheet and the loss curve of a checkpoint into the folder."""
     names = ("total", *(name for name, weight in loss.weights.items() if weight))
     figures = {
-        "sheet": report.style_sheet(camera, style=style, scenes=scenes, step=step, start=start),
+        "sheet": report.style_sheet(camera, style=picture, scenes=scenes, step=step, start=start),
         "loss": report.loss_figure(history, names),
     }
     for name, figure in figures.items():
@@ -282,7 +287,7 @@ def _stopping() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _write_report(path: Path, options: Options, settings: Any, trained: Trained, figures: dict[str, Any]) -> None:
+def _write_report(path: Path, options: Options, settings: Any, trained: style.Trained, figures: dict[str, Any]) -> None:
     seconds = sum(trained.profile.values())
     last = dict(zip(trained.names, trained.history[-20:].mean(0).tolist(), strict=True))
     summary = [

@@ -140,6 +140,7 @@ def test_a_gray_style_and_a_smaller_one(tmp_path: Path) -> None:
     assert torch.equal(picture[0], picture[1])
     small = train.style_picture(str(path), size=80)
     assert small.shape == (3, 48, 80)
+    assert (small - small.mean(0)).abs().max() < 1e-3  # gray stays gray
     light, kept = (float(Scene.from_rgb(p, illuminant="E").coefficients.mean()) for p in (picture, small))
     assert kept == pytest.approx(light, rel=0.03)  # filtered in linear light; coded values lose 10 %
 

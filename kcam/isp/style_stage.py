@@ -113,7 +113,7 @@ class StyleStage(Stage):
             if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
         if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
-            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 8, 8), got {noise!r}.")
+            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 4, 8), got {noise!r}.")
         if not 0 <= level < math.inf:
             raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.level = width, tuple(dilations), level

@@ -113,7 +113,7 @@ PRESETS: dict[str, Preset] = {
         Settings(steps=550, content_aim=AIM),
     ),
     "standard": Preset(
-        "256 pixels, more steps: half an hour on a CPU, a minute on a GPU",
+        "built-in scenes, 256 pixels, more steps",
         style_camera,
         PAINTED,
         Settings(steps=1000, size=256, content_aim=AIM),

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam import isp, optics, sensor
-from kcam.camera import DEMOSAICING, Camera
+from kcam.camera import DEMOSAICING, Camera, is_random
 from kcam.context import Stage
 from kcam.planner import Plan
 from kcam.scene import Scene
@@ -194,7 +194,7 @@ def photograph(
     Returns:   the pictures, and with `recorded` what the sensor records with and without optics, before any noise:
                the two sides of the thesis's L2 content loss (its figure 4.1).
     """
-    split = next((i for i, stage in enumerate(camera) if isinstance(stage, DEMOSAICING) or _is_random(stage)), 0)
+    split = next((i for i, stage in enumerate(camera) if isinstance(stage, DEMOSAICING) or is_random(stage)), 0)
     context = camera.resolve(scene)
     front = Camera(*camera.stages[:split], context=context)
     light = front(scene)
@@ -211,10 +211,6 @@ def photograph(
         with torch.no_grad():  # a target: it does not move towards the picture
             pair = (light, flat(scene.bands()))
     return torch.cat(rows), pair
-
-
-def _is_random(stage: Any) -> bool:
-    return callable(getattr(stage, "mean", None))
 
 
 def fit(
@@ -332,7 +328,7 @@ class _Run:
         scene, origins = self.source.draw(rows, seed=settings.seed, step=self.step)
         device = next(iter(self.named.values())).device
         scene = scene.to(device=device)
-        if settings.tolerance is not None and self.plan is None:
+        if self.plan is None:
             self._make_plan()
 
         def generator(number: int, stage: int) -> torch.Generator:
@@ -438,7 +434,10 @@ class _Run:
     # ---- plans -----------------------------------------------------------------------------------------------------
 
     def _make_plan(self) -> None:
-        """A plan for scenes that training draws; where one was made before, only if it now misses the tolerance."""
+        """A plan for scenes that training draws; where one was made before, only if it now misses the tolerance.
+
+        Without a tolerance there is none.
+        """
         tolerance = self.settings.tolerance
         if tolerance is None:
             return
