@@ -467,11 +467,13 @@ def test_a_full_disk_leaves_all_as_it_was(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 WRITER = """
-import sys
+import os, sys, time
 from pathlib import Path
 sys.path += sys.argv[2:]
 from test_checkpoints import content
 from kcam.style.checkpoints import Checkpoints
+fsync = os.fsync
+os.fsync = lambda opened: (time.sleep(0.01), fsync(opened))  # a slow disk: most of the time passes within a save
 store = Checkpoints(sys.argv[1], keep=2)
 found = store.latest()
 step = 0 if found is None else found.step
@@ -480,6 +482,14 @@ while True:
     store.save(step, **content(step), best=step % 5 == 0)  # the same again first, as a resumed run may
     step += 1
 """
+
+
+def wait_for_step(folder: Path, step: int, process: subprocess.Popen) -> None:
+    late = time.monotonic() + 60
+    while process.poll() is None and time.monotonic() < late:
+        if any(int(name[5:]) >= step for name in names(folder) if name.startswith("step-")):
+            return
+        time.sleep(0.002)
 
 
 @pytest.mark.slow  # 5 processes that import torch
@@ -491,7 +501,8 @@ def test_sigkill_at_random_moments(tmp_path: Path):
         command = [sys.executable, "-c", WRITER, tmp_path / "run", tests, tests / "style"]
         with subprocess.Popen(command, **pipes) as process:
             line = process.stdout.readline()
-            time.sleep(0.05 + 0.2 * draw.random())
+            wait_for_step(tmp_path / "run", int(line or 0) + 2, process)
+            time.sleep(0.2 * draw.random())
             process.send_signal(signal.SIGKILL)
             _, errors = process.communicate(timeout=60)
         began.append(int(line or -1))

@@ -320,6 +320,10 @@ def run_process(folder: Path, *extra: str, wait: bool = True, launcher: tuple[st
     return process
 
 
+def newest_step(folder: Path) -> int:
+    return max((int(path.name[5:]) for path in folder.glob("checkpoints/step-*")), default=0)
+
+
 @pytest.mark.slow
 def test_killed_five_times_it_ends_in_the_same_camera(tmp_path: Path) -> None:
     """SIGKILL at five moments, the last of them inside a save; the rest is resumed."""
@@ -328,15 +332,12 @@ def test_killed_five_times_it_ends_in_the_same_camera(tmp_path: Path) -> None:
     for kill in range(5):
         process = run_process(folder, "--resume", wait=False)
         deadline = time.monotonic() + 120
-        seen = len(list(folder.glob("checkpoints/step-*"))) if folder.exists() else 0
-        newest = max([int(p.name[5:]) for p in folder.glob("checkpoints/step-*")], default=0)
+        newest = newest_step(folder)
         while time.monotonic() < deadline and process.poll() is None:
             saving = list(folder.glob("checkpoints/.tmp-*"))
-            now = max([int(p.name[5:]) for p in folder.glob("checkpoints/step-*")], default=0)
-            if (kill == 4 and saving) or (kill < 4 and now > newest):
+            if (kill == 4 and saving) or (kill < 4 and newest_step(folder) > newest):
                 break
             time.sleep(0.0005)
-        del seen
         process.send_signal(signal.SIGKILL)
         process.communicate()
     run_process(folder, "--resume")
