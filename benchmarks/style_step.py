@@ -11,7 +11,8 @@ records with and without optics.
 The straightforward camera computes a padded FFT of the 891 x 891 pupil per wavelength, an FFT convolution for each
 band, and weighs each with the tile. kcam is what `kcam train --preset thesis` runs. It integrates the PSFs over the
 pixels; the textbook does so by averaging 2 x 2 samples in each, or takes point samples, which is cheaper and another
-quantity: both are timed, and what each does to the loss stands beside its time. The truth is kcam's own unfused path
+quantity: both are timed, and what each does to the loss stands beside its time. So are kcam's plans for a tolerance,
+as `kcam train --tolerance` freezes them between checkpoints. The truth is kcam's own unfused path
 in float64: each band by itself, then the filter.
 """
 
@@ -51,6 +52,8 @@ DIAMETER, RADIUS, PITCH, DISTANCE, DESIGN = 5 * mm, 25.8 * mm, 4 * um, 2.0, 550 
 PATCHES = 3900
 """Of an epoch: 256 x 256 pixels side by side in KAIST's 30 scenes of 2704 x 3376."""
 FASTER, SAME_TO = 6.0, 1e-4
+TOLERANCES = (0.01, 0.03)
+"""Of the plans that are raced beside the reference: fewer PSFs, the spectra's subspace."""
 DOUBLE_PIXELS = "textbook, 2 x 2 a pixel, complex128"
 SPARED_PIXELS = "textbook, 2 x 2 a pixel, checkpointed"
 Rows = list[dict[str, Any]]
@@ -246,6 +249,12 @@ class Bench:
         self.onto_picture = torch.randn(*shape, generator=generator)  # white: every frequency counts
         self.onto_light = torch.randn(sizes.batch, 1, *shape[2:], generator=generator)
         self.truth = self.unfused()
+        camera = self.cameras[True]
+        self.plans = {tolerance: camera.plan(self.scene, tolerance=tolerance) for tolerance in TOLERANCES}
+        self.planned = {
+            f"kcam, tolerance {tolerance:g}": Camera(*plan.apply(camera), context=camera.context)
+            for tolerance, plan in self.plans.items()
+        }
 
     def unfused(self) -> dict[str, Any]:
         """Pictures, loss and gradients of the preset's camera in float64, nothing of it fused."""
@@ -334,6 +343,9 @@ class Bench:
             take = lambda camera=own: kcam_picture(camera, self.scene)  # noqa: E731
             who = "kcam" if integrate else "kcam, points"
             contestants.append(contestant(who, own, take, take, default=integrate))
+        for who, own in self.planned.items():
+            take = lambda camera=own: kcam_picture(camera, self.scene)  # noqa: E731
+            contestants.append(contestant(who, camera, take, take))
         return race(
             f"preset thesis: camera, textbook by {'pixels' if pixels else 'points'}",
             size=self.size,
@@ -367,6 +379,10 @@ class Bench:
                 contestant("textbook, points, complex128", lambda: double(self.scene), dtype="complex128"),
                 contestant(SPARED_PIXELS, lambda: pixels(self.scene), dtype="complex64", once=True),
                 contestant("kcam", lambda: kcam_picture(camera, self.scene), default=True),
+                *(
+                    contestant(who, lambda own=own: kcam_picture(own, self.scene))
+                    for who, own in self.planned.items()
+                ),
             ],
             seconds=self.sizes.seconds,
             most_rounds=3,
@@ -419,6 +435,14 @@ def measure(sizes: Sizes, console: Console) -> dict[str, Any]:
         "environment": environment(),
         "targets": [] if quick else verdicts_of(rows + step),
         "loss": bench.truth["terms"],
+        "plans": [
+            {
+                "tolerance": tolerance,
+                "planning_seconds": plan.planning_seconds,
+                "chosen": {decision.effect: decision.chosen for decision in plan.decisions},
+            }
+            for tolerance, plan in bench.plans.items()
+        ],
         "projected": [] if quick else projected(step),
         "rows": rows + step,
     }

@@ -401,6 +401,8 @@ def train(
 @contextmanager
 def training_progress() -> Iterator[Callable[..., None]]:
     """Terms of the loss and the time left: a bar on a terminal, else a line every so often."""
+    from kcam.plots import duration
+
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TimeElapsedColumn())
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("train", total=None)
@@ -422,14 +424,6 @@ def training_progress() -> Iterator[Callable[..., None]]:
                     err.print(f"step {progress.step} of {steps}, {left} left:  {terms}", markup=False)
 
         yield advance
-
-
-def duration(seconds: float) -> str:
-    """A time for people, from seconds to days."""
-    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 @app.command()

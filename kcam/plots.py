@@ -248,7 +248,10 @@ def _time_bars(
 
 
 def duration(seconds: float) -> str:
-    """A time for people: three figures at most."""
+    """A time for people, from milliseconds to days: three figures at most."""
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.3g} {unit}"
     if seconds >= 0.9995:
         return f"{seconds:.3g} s" if seconds < 100 else f"{seconds:.0f} s"
     return f"{seconds * 1e3:.0f} ms" if seconds >= 0.01 else f"{seconds * 1e3:.1f} ms"

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcam import __version__, files, plots, report, style
+from kcam import __version__, files, isp, plots, report, style
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
 
@@ -31,8 +31,8 @@ class Options:
 
     style: a picture's path, or the name of one of `kcam.style.STYLES`. out: the camera to write, .safetensors; beside
     it stands a folder of its name with checkpoints, pictures and the report. patches: a patch store; None: the built-in
-    scenes. camera: a saved one to start from. features: "steerable" or "vgg16", with vgg_weights. stage: False trains
-    the camera alone. style_size: longer side that the style is shrunk to; None: as it is.
+    scenes. camera: a saved one to start from. features: "steerable" or "vgg16", with vgg_weights. stage: False takes
+    the style stage off. style_size: longer side that the style is shrunk to; None: as it is.
     """
 
     style: str
@@ -181,9 +181,10 @@ def _show(
 
 
 def _camera(options: Options, preset: style.Preset) -> Camera:
-    if options.camera is not None:
-        return Camera.load(options.camera)
-    return preset.camera() if preset.camera is not style.style_camera else style.style_camera(stage=options.stage)
+    camera = preset.camera() if options.camera is None else Camera.load(options.camera)
+    if options.stage:
+        return camera
+    return Camera(*(stage for stage in camera if not isinstance(stage, isp.StyleStage)), context=camera.context)
 
 
 def _source(options: Options, preset: style.Preset) -> style.Source:

@@ -374,13 +374,9 @@ def test_raw_is_shown_bright_and_black_is_black(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_durations() -> None:
-    assert [plots.duration(s) for s in (0.0012, 0.0123, 0.9999, 12.34, 123.4)] == [
-        "1.2 ms",
-        "12 ms",
-        "1 s",
-        "12.3 s",
-        "123 s",
-    ]
+    times = {0.0012: "1.2 ms", 0.0123: "12 ms", 0.9999: "1 s", 12.34: "12.3 s", 119: "119 s", 123.4: "2.06 min"}
+    times |= {8000: "2.22 h", 500_000: "5.79 days"}
+    assert {seconds: plots.duration(seconds) for seconds in times} == times
 
 
 def test_demo_small(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -19,6 +19,9 @@ TILE = 512
 LENGTH, WIDTH = 7.0, 1.5
 """Standard deviations of drawn-out noise along its direction and across [pixels]."""
 LONGEST = 14
+DIRECTIONS = 8
+CELL, SMOOTHED = 8, 1.5
+"""Pixels between the random vectors that make directions flow, and the Gaussian that smooths these [cells]."""
 WINDOWS = 4
 """Across and down: where the statistics of a picture in tiles are taken."""
 DARKEST = 0.03
@@ -80,8 +83,8 @@ class StyleStage(Stage):
     Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where the last
     convolution also sees what the first one made: the detail of the picture and of the noise. Without noise a network
     that sees only the picture must leave an even area even; planes of Gaussian noise, beside the picture and at a
-    quarter of its size, let strokes grow there (as in texture networks). Those beside the picture are drawn out, by
-    Gaussians 7 pixels long and 1.5 wide and by twice as large ones, along directions that divide the half circle: from
+    quarter of its size, let strokes grow there (as in texture networks). Those beside the picture are drawn out along
+    directions that flow over the picture, by Gaussians 7 pixels long and 1.5 wide and by twice as large ones: from
     white noise a small network learns grain before it learns strokes. As it is built it changes nothing but values
     below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
@@ -91,13 +94,14 @@ class StyleStage(Stage):
 
     Args:      width: channels at full size; twice and four times as many at half and a quarter.
                dilations: of the residual blocks.
-               noise: planes of white noise at full size, directions of drawn-out noise, which has two planes for each,
-               and planes of white noise at a quarter of the size.
+               noise: planes of white noise at full size, of drawn-out noise of each of its two sizes, and of white
+               noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
     Raises:    ValueError for a width or a dilation below 1, anything but three numbers of planes >= 0, a level that is
                negative or not finite, and at the call for another number of channels than 3.
     Source:    Johnson, Alahi and Fei-Fei, Perceptual losses for real-time style transfer and super-resolution (2016);
-               Ulyanov et al., Texture networks (2016), the noise; instance normalisation (2016).
+               Ulyanov et al., Texture networks (2016), the noise; instance normalisation (2016); Cabral and Leedom,
+               Imaging vector fields using line integral convolution (1993), noise drawn out along a flow.
     """
 
     def __init__(
@@ -105,7 +109,7 @@ class StyleStage(Stage):
         *,
         width: int = 16,
         dilations: Sequence[int] = (1, 2, 4, 8),
-        noise: tuple[int, int, int] = (0, 4, 8),
+        noise: tuple[int, int, int] = (0, 1, 8),
         level: float = 1.0,
     ) -> None:
         super().__init__()
@@ -113,7 +117,7 @@ class StyleStage(Stage):
             if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
         if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
-            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 4, 8), got {noise!r}.")
+            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 1, 8), got {noise!r}.")
         if not 0 <= level < math.inf:
             raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.level = width, tuple(dilations), level
@@ -180,23 +184,14 @@ class StyleStage(Stage):
             return fine, picture.new_zeros(batch, at_quarter, height // 4, width // 4)
         if generator is not None and generator.device != picture.device:
             where["device"] = generator.device
-        shapes = (
-            (white, height, width),
-            (at_quarter, height // 4, width // 4),
-            (drawn_out, height + 2 * LONGEST, width + 2 * LONGEST),
-            (drawn_out, height // 2 + 2 * LONGEST, width // 2 + 2 * LONGEST),
-        )
-        fine, coarse, thin, wide = (
-            torch.randn(batch, *shape, generator=generator, **where).to(picture.device) for shape in shapes
-        )
+
+        def draw(planes: int, rows: int, columns: int) -> Tensor:
+            return torch.randn(batch, planes, rows, columns, generator=generator, **where).to(picture)
+
+        fine, coarse = draw(white, height, width), draw(at_quarter, height // 4, width // 4)
         if drawn_out:
-            kernels = stroke_kernels(drawn_out).to(picture)
-            around = 2 * LONGEST
-            fine = torch.cat([fine, fine.new_empty(batch, 2 * drawn_out, height, width)], dim=1)
-            for top in range(0, height, TILE):  # torch pads a few planes to sixteen: of 12 megapixels, 0.8 GB
-                strip = thin[..., top : top + TILE + around, :]
-                fine[:, white : white + drawn_out, top : top + TILE] = F.conv2d(strip, kernels, groups=drawn_out)
-            fine[:, white + drawn_out :] = _doubled(F.conv2d(wide, kernels, groups=drawn_out))
+            thin, wide = (_flowing(draw, drawn_out, height // size, width // size) for size in (1, 2))
+            fine = torch.cat([fine, thin, _doubled(wide)], dim=1)
         return self.level * fine, self.level * coarse
 
     def _paint(
@@ -237,11 +232,42 @@ class StyleStage(Stage):
         return result
 
 
-def stroke_kernels(count: int) -> Tensor:
-    """Gaussians of sigma 7 by 1.5 pixels along `count` directions, (count,1,29,29), that keep the variance of noise."""
+def _flowing(draw: Callable[[int, int, int], Tensor], planes: int, height: int, width: int) -> Tensor:
+    """Noise (B,planes,height,width) of mean 0 and variance 1, drawn out along directions that flow over it.
+
+    The direction is half the angle of a smooth random vector; white noise is convolved with a stroke along each of
+    `DIRECTIONS`, and between the two nearest ones interpolated.
+    """
+    white = draw(planes, height + 2 * LONGEST, width + 2 * LONGEST).flatten(0, 1)[:, None]
+    reach = math.ceil(3 * SMOOTHED)
+    around = 2 * (reach + 2)  # two cells on each side for the cubic interpolation
+    vectors = draw(2 * planes, *(-(-size // CELL) + around for size in (height, width))).flatten(0, 1)[:, None]
+    bell = torch.exp(-(torch.arange(-reach, reach + 1).to(vectors) ** 2) / (2 * SMOOTHED**2))
+    vectors = F.conv2d(vectors, (bell[:, None] * bell)[None, None])
+    vectors = vectors.view(-1, 2, *vectors.shape[-2:])
+    kernels = stroke_kernels().to(white)
+    overlap = float((kernels[0] * kernels[1]).sum())
+    strips = []
+    for top in range(0, height, TILE):  # of 12 megapixels, all directions would take 0.4 GB a plane
+        rows = min(TILE, height - top)
+        drawn = F.conv2d(white[..., top : top + rows + 2 * LONGEST, :], kernels)
+        cells = vectors[..., top // CELL : -(-(top + rows) // CELL) + 4, :]
+        flow = F.interpolate(cells, scale_factor=CELL, mode="bicubic", align_corners=False)
+        flow = flow[..., 2 * CELL : 2 * CELL + rows, 2 * CELL : 2 * CELL + width]
+        place = torch.atan2(flow[:, 1:], flow[:, :1]) * (DIRECTIONS / (2 * math.pi))
+        below = place.floor()
+        share = place - below
+        first, second = (drawn.gather(1, (below.long() + step) % DIRECTIONS) for step in (0, 1))
+        variance = (1 - share) ** 2 + share**2 + 2 * overlap * share * (1 - share)
+        strips.append((first * (1 - share) + second * share) * variance.rsqrt())
+    return torch.cat(strips, dim=2).view(-1, planes, height, width)
+
+
+def stroke_kernels() -> Tensor:
+    """Gaussians of sigma 7 by 1.5 pixels along 8 directions, (8,1,29,29), that keep the variance of noise."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
-    angle = torch.arange(count, dtype=torch.float64)[:, None, None] * (math.pi / count)
+    angle = torch.arange(DIRECTIONS, dtype=torch.float64)[:, None, None] * (math.pi / DIRECTIONS)
     along, across = x * torch.cos(angle) + y * torch.sin(angle), y * torch.cos(angle) - x * torch.sin(angle)
     kernels = torch.exp(-(along**2) / (2 * LENGTH**2) - across**2 / (2 * WIDTH**2))
     return (kernels / kernels.square().sum((-2, -1), keepdim=True).sqrt())[:, None]
