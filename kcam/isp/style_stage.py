@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.precision import full_precision
+from kcam.ste import clip_ste
 
 SEEN_AT_ONCE = 2**20
 """Pixels; a larger picture is painted in tiles."""
@@ -26,6 +27,8 @@ WINDOWS = 4
 """Across and down: where the statistics of a picture in tiles are taken."""
 DARKEST = 0.03
 """What black is taken for, and 1 - 0.03 for white, so that strokes can lie on them: the logit has no bound."""
+FURTHEST = 4.0
+"""Bound of the result's logit, 0.018 and 0.982: beyond it the sigmoid has no gradient that would bring it back."""
 
 
 class _Conv(nn.Conv2d):
@@ -78,7 +81,7 @@ class _Residual(nn.Module):
 class StyleStage(Stage):
     """A feed-forward network that repaints a picture, in the manner of Johnson et al. (2016), with noise.
 
-    y = sigmoid( M logit(x) + network(x, noise) )
+    y = sigmoid( clip( M logit(x) + network(x, noise), -4, 4) )
 
     Down to a quarter of the size in two strided convolutions, dilated residual blocks, and back up, where the last
     convolution also sees what the first one made: the detail of the picture and of the noise. Without noise a network
@@ -161,7 +164,7 @@ class StyleStage(Stage):
         return quiet
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
-        """(B,3,H,W) sRGB in [0,1] to the same shape, in (0,1)."""
+        """(B,3,H,W) sRGB in [0,1] to the same shape, in 0.018..0.982."""
         if signal.ndim != 4 or signal.shape[1] != 3:
             raise ValueError(
                 f"StyleStage repaints pictures (B,3,H,W), got shape {tuple(signal.shape)}. Put it behind the ToneCurve."
@@ -210,7 +213,8 @@ class StyleStage(Stage):
         x = F.relu(self.up2_norm(self.up2(_doubled(x)), *how))
         strokes = self.leave(torch.cat([x, fine], dim=1)).to(coded)
         with full_precision(coded.device):  # autocast may round what is painted, not what is kept
-            return torch.sigmoid(torch.einsum("nc,bchw->bnhw", self.colour, coded) + strokes)
+            painted = torch.einsum("nc,bchw->bnhw", self.colour, coded) + strokes
+            return torch.sigmoid(clip_ste(painted, -FURTHEST, FURTHEST))
 
     def _in_tiles(self, picture: Tensor, noise: tuple[Tensor, Tensor]) -> Tensor:
         """A large picture, tile by tile with a border as wide as the reach: bounded memory, no seams."""

@@ -122,27 +122,39 @@ def luminance(picture: Tensor) -> Tensor:
     return torch.einsum("c,bchw->bhw", picture.new_tensor(LUMINANCE), picture)[:, None]
 
 
-def correlation_loss(picture: Tensor, scene: Tensor, *, levels: tuple[int, ...], window: int = 11) -> Tensor:
+def correlation_loss(
+    picture: Tensor, scene: Tensor, *, levels: tuple[int, ...], window: int = 11, whole: bool = False
+) -> Tensor:
     """How much of what the scene shows is lost: local correlation of luminance, blind to colour, not to the sign.
 
     mean over levels and windows of  w (1 - cov(y, t) / sqrt(var y var t)),   w = var t / (var t + 1e-3)
 
-    A negative scores up to twice as high as a picture that shows nothing. Coarse levels leave room for strokes.
+    A negative scores up to twice as high as a picture that shows nothing. Coarse levels leave room for strokes, and
+    with `whole` what is bright stays brighter than what is dark, strokes and all.
 
     Args:      picture, scene: (B,3,H,W).  levels: factors by which both are averaged first.  window: side [pixels].
+               whole: count the whole picture, at full size and as one window, as one level more.
     """
+    y, t = (x - x.mean((-2, -1), keepdim=True) for x in (luminance(picture), luminance(scene)))  # for rounding alone
     losses = []
     for level in levels:
-        y, t = (F.avg_pool2d(luminance(x), level) if level > 1 else luminance(x) for x in (picture, scene))
-        side = min(window, *y.shape[-2:])
-        mean_y, mean_t, square_y, square_t, product = F.avg_pool2d(
-            torch.cat([y, t, y * y, t * t, y * t], dim=1), side, stride=1
-        ).split(1, dim=1)
-        var_y = (square_y - mean_y**2).clamp(min=0) + 1e-5
-        var_t = (square_t - mean_t**2).clamp(min=0)
-        correlation = (product - mean_y * mean_t) / (var_y * (var_t + 1e-5)).sqrt()
-        losses.append((var_t / (var_t + FLAT) * (1 - correlation)).mean())
+        coarse = F.avg_pool2d(y, level), F.avg_pool2d(t, level)
+        side = min(window, *coarse[0].shape[-2:])
+        losses.append(_lost(*coarse, (side, side)))
+    if whole:
+        losses.append(_lost(y, t, y.shape[-2:]))
     return torch.stack(losses).mean()
+
+
+def _lost(y: Tensor, t: Tensor, side: tuple[int, ...]) -> Tensor:
+    """One level of `correlation_loss`, in windows of some rows and columns."""
+    mean_y, mean_t, square_y, square_t, product = F.avg_pool2d(
+        torch.cat([y, t, y * y, t * t, y * t], dim=1), side, stride=1
+    ).split(1, dim=1)
+    var_y = (square_y - mean_y**2).clamp(min=0) + 1e-5
+    var_t = (square_t - mean_t**2).clamp(min=0)
+    correlation = (product - mean_y * mean_t) / (var_y * (var_t + 1e-5)).sqrt()
+    return (var_t / (var_t + FLAT) * (1 - correlation)).mean()
 
 
 # ---- all together -------------------------------------------------------------------------------------------------
@@ -164,7 +176,7 @@ class StyleLoss(nn.Module):
         statistic: "moments" (`moment_loss`) or "gram" (eq. 3.12), the mean and the sum over the layers.
         content_by: "correlation" (`correlation_loss`), or "features": eq. 3.10 at the layer `content_layer`.
         style, colour, content, l2, tv: weights; a term of weight 0 is not computed.
-        levels, window: of the correlation.
+        levels, window, whole: of the correlation.
         content_layer: of the features, where content_by is "features".
         crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
     Raises:    ValueError for an unknown name, weights that are negative or all 0, or a style that is too small;
@@ -189,6 +201,7 @@ class StyleLoss(nn.Module):
         tv: float = 0.0,
         levels: tuple[int, ...] = (1, 2, 4),
         window: int = 11,
+        whole: bool = False,
         content_layer: str = "relu3_3",
         crop: int | None = None,
     ) -> None:
@@ -208,7 +221,8 @@ class StyleLoss(nn.Module):
             raise ValueError(f"window must be at least 2 pixels, got {window!r}. Use window=11.")
         self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
-        self.levels, self.window, self.content_layer = tuple(levels), window, content_layer
+        self.levels, self.window, self.whole = tuple(levels), window, whole
+        self.content_layer = content_layer
         crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
         self.crop = crops.shape[-1]
         with torch.no_grad():
@@ -302,7 +316,7 @@ class StyleLoss(nn.Module):
 
     def _content(self, picture: Tensor, scene: Tensor, layers: dict[str, Tensor]) -> Tensor:
         if self.content_by == "correlation":
-            return correlation_loss(picture, scene, levels=self.levels, window=self.window)
+            return correlation_loss(picture, scene, levels=self.levels, window=self.window, whole=self.whole)
         with torch.no_grad():
             target = self.features(scene)[self.content_layer]
         return content_loss(layers[self.content_layer], target)

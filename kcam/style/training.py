@@ -488,6 +488,7 @@ class _Run:
             "settings": {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()},
             "style": style,
             "loss": {"weights": loss.weights, "statistic": loss.statistic, "content_by": loss.content_by},
+            "correlation": {"levels": list(loss.levels), "window": loss.window, "whole": loss.whole},
             "features": self.loss.features.name,
             "parameters": {name: list(p.shape) for name, p in self.named.items()},
         }

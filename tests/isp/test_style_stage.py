@@ -184,6 +184,19 @@ def test_stroke_kernels_turn_with_their_number() -> None:
 # ---- gradients ------------------------------------------------------------------------------------------------------
 
 
+def test_what_went_too_far_can_come_back() -> None:
+    """A sigmoid at 60 has no gradient; at its bound it has one, and only inwards."""
+    stage, picture = painting_stage(**SMALL), random_picture(1, 3, 16, 16)
+    with torch.no_grad():
+        stage.leave.bias.fill_(60.0)
+    bias = stage.leave.bias
+    bright = stage(picture, Context(generator=seeded()))
+    torch.testing.assert_close(bright, torch.full_like(bright, torch.sigmoid(torch.tensor(4.0)).item()))
+    darker, brighter = (torch.autograd.grad(sign * bright.sum(), bias, retain_graph=True)[0] for sign in (1, -1))
+    assert (darker > 1).all()
+    assert (brighter == 0).all()
+
+
 def test_the_gradient_is_the_slope() -> None:
     """In float64, along random directions of picture and weights, against a central difference."""
     stage = painting_stage(width=2, dilations=(1,), noise=(1, 2, 1)).double()

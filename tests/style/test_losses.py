@@ -274,6 +274,14 @@ def test_correlation_by_its_equation(level: int, shape: tuple[int, int]):
     assert correlation_loss(picture, scene, levels=(level,)).item() == pytest.approx(expected, rel=1e-5)
 
 
+def test_the_whole_picture_is_a_level_more():
+    picture, scene = noise(1, 3, 32, 48), noise(1, 3, 32, 48, seed=1)
+    coarse, both = (correlation_loss(picture, scene, levels=(2,), whole=whole).item() for whole in (False, True))
+    y, t = (luminance(x).flatten().numpy() for x in (picture, scene))
+    r = np.cov(y, t, bias=True)[0, 1] / np.sqrt((y.var() + 1e-5) * (t.var() + 1e-5))
+    assert 2 * both - coarse == pytest.approx(t.var() / (t.var() + 1e-3) * (1 - r), rel=1e-5)
+
+
 @pytest.mark.parametrize("levels", [(1,), (1, 2, 4), (2, 4, 8)])
 def test_correlation_sees_the_sign_and_not_the_colour(photograph: Tensor, levels: tuple[int, ...]):
     def lost(picture: Tensor) -> float:
