@@ -247,29 +247,27 @@ def pixel_weights(edges: Tensor, nodes: Tensor, *, spacing: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class MapWeights:
-    """Linear map from an n x n pixel map onto an N x N pupil grid, separable: one matrix (n, N) for both axes.
+class _Banded:
+    """A banded matrix (n, N) that acts on both axes: field (n, n) -> matrix^T field matrix (N, N).
 
     slabs: the matrix cut into slabs of columns, each with only the band of rows that it needs; starts: of the bands.
     """
 
     slabs: tuple[Tensor, ...]
     starts: tuple[int, ...]
-    inputs: int
     outputs: int
 
     @staticmethod
-    def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> MapWeights:
-        """Cut the bands out of a dense matrix (n, N)."""
+    def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> _Banded:
+        """Cut the bands out of a dense matrix."""
         inputs, outputs = matrix.shape
         slabs, starts = [], []
-        for first in range(0, outputs, _SLAB_COLUMNS):
-            columns = matrix[:, first : first + _SLAB_COLUMNS]
+        for columns in matrix.split(max(_SLAB_COLUMNS, _SLAB_COLUMNS * outputs // inputs), dim=1):
             rows = (columns != 0).any(1).nonzero().flatten()
             low, high = (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 1)
             slabs.append(columns[low:high].to(device, dtype))
             starts.append(low)
-        return MapWeights(tuple(slabs), tuple(starts), inputs, outputs)
+        return _Banded(tuple(slabs), tuple(starts), outputs)
 
     def _pieces(self) -> Iterator[tuple[Tensor, slice, slice]]:
         """(matrix, its inputs, its outputs)."""
@@ -278,8 +276,7 @@ class MapWeights:
             yield slab, slice(start, start + slab.shape[0]), slice(at, at + slab.shape[1])
             at += slab.shape[1]
 
-    def forward(self, field: Tensor) -> Tensor:
-        """(n, n) -> (N, N)."""
+    def __call__(self, field: Tensor) -> Tensor:
         half = field.new_empty(field.shape[0], self.outputs)
         for matrix, source, target in self._pieces():
             torch.mm(field[:, source], matrix, out=half[:, target])
@@ -288,15 +285,21 @@ class MapWeights:
             torch.mm(matrix.T, half[source], out=grid[target])
         return grid
 
-    def adjoint(self, grid: Tensor) -> Tensor:
-        """(N, N) -> (n, n), the transpose of `forward`."""
-        half = grid.new_zeros(self.inputs, self.outputs)
-        for matrix, source, target in self._pieces():
-            half[source].addmm_(matrix, grid[target])
-        field = grid.new_zeros(self.inputs, self.inputs)
-        for matrix, source, target in self._pieces():
-            field[:, source].addmm_(half[:, target], matrix.T)
-        return field
+
+@dataclass(frozen=True)
+class MapWeights:
+    """Linear map from an n x n pixel map onto an N x N pupil grid, separable: one matrix (n, N) for both axes."""
+
+    forward: _Banded
+    """(n, n) -> (N, N)."""
+    adjoint: _Banded
+    """(N, N) -> (n, n), the transpose of `forward`."""
+
+    @staticmethod
+    def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> MapWeights:
+        """From the dense matrix (n, N)."""
+        banded = (_Banded.build(m, dtype=dtype, device=device) for m in (matrix, matrix.T))
+        return MapWeights(*banded)
 
 
 class Onto(Protocol):
