@@ -309,8 +309,13 @@ class Bench:
         single: dict[str, Any] = {"field_dtype": torch.complex64}
         if pixels:
             return {"textbook, 2 x 2 a pixel": single | {"oversample": 2}, DOUBLE_PIXELS: {"oversample": 2}}
-        unpadded = {"padded": self.sizes.pupil}
-        return {"textbook, points": single, "textbook, points, complex128": {}, "textbook, unpadded": single | unpadded}
+        unpadded, twice = ({"padded": times * self.sizes.pupil} for times in (1, 2))
+        return {
+            "textbook, points": single,
+            "textbook, points, complex128": {},
+            "textbook, unpadded": single | unpadded,
+            "textbook, padded to twice": single | twice,
+        }
 
     def camera_rows(self, *, pixels: bool, backward: bool) -> Rows:
         """The camera part alone: forward as training runs it, with what the backward pass will need."""

@@ -87,9 +87,9 @@ class StyleStage(Stage):
     convolution also sees what the first one made: the detail of the picture and of the noise. Without noise a network
     that sees only the picture must leave an even area even; planes of Gaussian noise, beside the picture and at a
     quarter of its size, let strokes grow there (as in texture networks). Those beside the picture are drawn out along
-    directions that flow over the picture, by Gaussians 7 pixels long and 1.5 wide and by twice as large ones: from
-    white noise a small network learns grain before it learns strokes. As it is built it changes nothing but values
-    below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
+    and across directions that flow over the picture, by Gaussians 7 pixels long and 1.5 wide and by twice as large
+    ones: from white noise a small network learns grain before it learns strokes. As it is built it changes nothing but
+    values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
     The noise comes from the context's generator: the same generator state, picture and weights give the same bytes. A
     picture of more than a megapixel is painted tile by tile; the statistics that its instance normalisation divides by
@@ -112,7 +112,7 @@ class StyleStage(Stage):
         *,
         width: int = 16,
         dilations: Sequence[int] = (1, 2, 4, 8),
-        noise: tuple[int, int, int] = (0, 1, 8),
+        noise: tuple[int, int, int] = (0, 2, 8),
         level: float = 1.0,
     ) -> None:
         super().__init__()
@@ -120,7 +120,7 @@ class StyleStage(Stage):
             if not values or not all(isinstance(value, int) and value >= 1 for value in values):
                 raise ValueError(f"{name} must be positive whole numbers, got {values!r}.")
         if len(noise) != 3 or not all(isinstance(value, int) and value >= 0 for value in noise):
-            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 1, 8), got {noise!r}.")
+            raise ValueError(f"noise must be three whole numbers >= 0, such as (0, 2, 8), got {noise!r}.")
         if not 0 <= level < math.inf:
             raise ValueError(f"level must be a finite number >= 0, got {level!r}. 1.0 is what a stage is trained with.")
         self.width, self.dilations, self.level = width, tuple(dilations), level
@@ -240,31 +240,38 @@ def _flowing(draw: Callable[[int, int, int], Tensor], planes: int, height: int, 
     """Noise (B,planes,height,width) of mean 0 and variance 1, drawn out along directions that flow over it.
 
     The direction is half the angle of a smooth random vector; white noise is convolved with a stroke along each of
-    `DIRECTIONS`, and between the two nearest ones interpolated.
+    `DIRECTIONS`, and between the two nearest ones interpolated. Every second plane is drawn out across the flow of the
+    one before: together they make tiles.
     """
-    white = draw(planes, height + 2 * LONGEST, width + 2 * LONGEST).flatten(0, 1)[:, None]
+    white = draw(planes, height + 2 * LONGEST, width + 2 * LONGEST)
     reach = math.ceil(3 * SMOOTHED)
     around = 2 * (reach + 2)  # two cells on each side for the cubic interpolation
-    vectors = draw(2 * planes, *(-(-size // CELL) + around for size in (height, width))).flatten(0, 1)[:, None]
+    flows = -(-planes // 2)
+    vectors = draw(2 * flows, *(-(-size // CELL) + around for size in (height, width))).flatten(0, 1)[:, None]
     bell = torch.exp(-(torch.arange(-reach, reach + 1).to(vectors) ** 2) / (2 * SMOOTHED**2))
     vectors = F.conv2d(vectors, (bell[:, None] * bell)[None, None])
     vectors = vectors.view(-1, 2, *vectors.shape[-2:])
+    across = (torch.arange(planes, device=white.device) % 2 * (DIRECTIONS // 2))[:, None, None]
     kernels = stroke_kernels().to(white)
     overlap = float((kernels[0] * kernels[1]).sum())
     strips = []
     for top in range(0, height, TILE):  # of 12 megapixels, all directions would take 0.4 GB a plane
         rows = min(TILE, height - top)
-        drawn = F.conv2d(white[..., top : top + rows + 2 * LONGEST, :], kernels)
+        drawn = F.conv2d(white[..., top : top + rows + 2 * LONGEST, :].flatten(0, 1)[:, None], kernels)
+        drawn = drawn.unflatten(0, (-1, planes))
         cells = vectors[..., top // CELL : -(-(top + rows) // CELL) + 4, :]
         flow = F.interpolate(cells, scale_factor=CELL, mode="bicubic", align_corners=False)
-        flow = flow[..., 2 * CELL : 2 * CELL + rows, 2 * CELL : 2 * CELL + width]
-        place = torch.atan2(flow[:, 1:], flow[:, :1]) * (DIRECTIONS / (2 * math.pi))
+        flow = flow[..., 2 * CELL : 2 * CELL + rows, 2 * CELL : 2 * CELL + width].unflatten(0, (-1, flows))
+        turns = torch.atan2(flow[:, :, 1], flow[:, :, 0]) * (DIRECTIONS / (2 * math.pi))
+        place = turns.repeat_interleave(2, dim=1)[:, :planes] + across
         below = place.floor()
         share = place - below
-        first, second = (drawn.gather(1, (below.long() + step) % DIRECTIONS) for step in (0, 1))
+        first, second = (
+            drawn.gather(2, (below.long() + step)[:, :, None] % DIRECTIONS).squeeze(2) for step in (0, 1)
+        )
         variance = (1 - share) ** 2 + share**2 + 2 * overlap * share * (1 - share)
         strips.append((first * (1 - share) + second * share) * variance.rsqrt())
-    return torch.cat(strips, dim=2).view(-1, planes, height, width)
+    return torch.cat(strips, dim=2)
 
 
 def stroke_kernels() -> Tensor:
