@@ -110,7 +110,7 @@ PRESETS: dict[str, Preset] = {
         "built-in scenes, 128 pixels: minutes on a laptop",
         style_camera,
         PAINTED,
-        Settings(steps=550, content_aim=AIM),
+        Settings(steps=600, content_aim=AIM),
     ),
     "standard": Preset(
         "built-in scenes, 256 pixels, more steps",

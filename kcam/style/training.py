@@ -42,7 +42,7 @@ DIVERGED = 10.0  # times the median of the last losses
 MEMORY = 50  # losses
 LOOK = 20  # steps between looks at the pictures
 AIMED_FROM = 50  # steps: before, there is more scene than style in any picture
-AIM_GAIN, AIM_MEMORY, AIM_RANGE = 0.02, 0.95, 8.0
+AIM_GAIN, AIM_MEMORY, AIM_RANGE = 0.02, 0.95, 2.0
 MOST_RETURNS = 3
 CLIPPED, NEGATIVE, DEAD = 0.1, 0.3, 0.05
 
@@ -66,7 +66,7 @@ class Settings:
     clip: largest norm of the gradient; inf for any.
     average: of the weights, that is what is exported: share of the past, 0 for the last weights as they are.
     every: steps between checkpoints.
-    content_aim: None leaves the content term at its weight; else its weight follows, within a factor of 8, so that the
+    content_aim: None leaves the content term at its weight; else its weight follows, within a factor of 2, so that the
         content loss itself settles here: strong strokes and faint ones then leave as much of the scene.
     tolerance: None trains through the reference physics; else through a plan for the training scenes, which is frozen
         between checkpoints and made anew where it is measured to miss the tolerance: see `kcam.Plan`.
