@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcam.augmentation.base import CameraAugmentation, wavelengths_of
 from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
-from kcam.isp import apply_colour_matrix
+from kcam.isp import apply_colour_matrix, render_tones
 from kcam.units import nm, wavelength_grid
 
 DAYLIGHT = 6504.0  # K, the correlated colour temperature of D65
@@ -139,11 +139,4 @@ class RandomToneCurve(CameraAugmentation):
         """Values are clipped to 0..1 first, outside of which the curve would turn; row by row, which stays in cache."""
         gammas, contrasts = (drawn[name].to(signal).unbind() for name in ("gamma", "contrast"))
         rows = zip(signal, gammas, contrasts, strict=True)
-        return torch.stack([_tone(row, gamma=gamma, contrast=contrast) for row, gamma, contrast in rows])
-
-
-def _tone(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
-    offset = 0.01
-    low = offset**gamma
-    tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
-    return tone + 2 * contrast * tone * (1 - tone) * (2 * tone - 1)
+        return torch.stack([render_tones(row, gamma=gamma, contrast=contrast) for row, gamma, contrast in rows])

@@ -9,6 +9,7 @@ from kcam.isp.colour import (
     as_shot_colour_matrix,
     as_shot_gains,
     fit_colour_matrix,
+    render_tones,
     tone_curve,
     white_balance,
 )
@@ -41,6 +42,7 @@ __all__ = [
     "demosaic",
     "fit_colour_matrix",
     "learned_demosaic",
+    "render_tones",
     "tone_curve",
     "white_balance",
 ]

@@ -201,13 +201,15 @@ class ColourMatrix(Stage):
         return 3
 
 
-def tone_curve(signal: Tensor) -> Tensor:
+def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor | None = None) -> Tensor:
     """Linear sRGB to coded sRGB: clipped to 0..1, then the sRGB transfer function of IEC 61966-2-1.
 
     v = 12.92 x                  x <= 0.0031308
     v = 1.055 x^(1/2.4) - 0.055  above
 
-    Args:      signal: (..., 3, H, W), or one channel of gray.
+    With a gamma or a contrast another rendering of these tones follows: `render_tones`.
+
+    Args:      signal: (..., 3, H, W), or one channel of gray.  gamma, contrast: 0-d, or one for each channel.
     Returns:   same shape, in [0,1]. The gradient is finite everywhere; beyond the clip it is that of `clip_ste`.
     Raises:    ValueError for another number of channels.
     """
@@ -218,16 +220,66 @@ def tone_curve(signal: Tensor) -> Tensor:
         )
     clipped = clip_ste(signal, 0.0, 1.0)
     if channels == 3:
-        return linear_rgb_to_rgb(clipped)
-    return linear_rgb_to_rgb(clipped.expand(*signal.shape[:-3], 3, -1, -1))[..., :1, :, :]
+        coded = linear_rgb_to_rgb(clipped)
+    else:
+        coded = linear_rgb_to_rgb(clipped.expand(*signal.shape[:-3], 3, -1, -1))[..., :1, :, :]
+    if gamma is None and contrast is None:
+        return coded
+    held = [coded.new_tensor(1.0) if gamma is None else gamma, coded.new_tensor(0.0) if contrast is None else contrast]
+    if any(value.numel() not in (1, channels) for value in held):
+        raise ValueError(f"gamma and contrast of three channels do not fit one of gray, {tuple(signal.shape)}.")
+    gamma, contrast = (value.to(coded)[..., None, None] for value in held)
+    return render_tones(coded, gamma=gamma, contrast=contrast)
+
+
+def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
+    """Another rendering of tones in 0..1, outside of which they are clipped: a gamma, then an S-curve.
+
+    u = ((v + e)^gamma - e^gamma) / ((1 + e)^gamma - e^gamma),  e = 0.01;   y = u + 2 c u (1 - u) (2 u - 1)
+
+    Both keep black at 0 and white at 1 and rise everywhere; e keeps the slope at black finite.
+
+    Args:      signal: any shape.  gamma: above 1 darkens; taken as 0.1 to 10.  contrast: c, taken as -0.49 to 0.49.
+               Beyond these bounds the gradients of both are those of `clip_ste`. They broadcast against the signal.
+    """
+    gamma, contrast = clip_ste(gamma, 0.1, 10.0), clip_ste(contrast, -0.49, 0.49)
+    offset = 0.01
+    low = offset**gamma
+    tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
+    return tone + 2 * contrast * tone * (1 - tone) * (2 * tone - 1)
 
 
 class ToneCurve(Stage):
-    """The sRGB curve: `tone_curve`."""
+    """The sRGB curve, and if asked for a gamma and a contrast after it: `tone_curve`.
+
+    Args:      gamma, contrast: numbers or tensors, 0-d or (3,) for red, green and blue; an nn.Parameter trains, such
+               as nn.Parameter(torch.ones(3)) and nn.Parameter(torch.zeros(3)), which change nothing. None: 1 and 0.
+    Raises:    TypeError, ValueError for other shapes, a gamma outside 0.1..10, or a contrast outside -0.49..0.49.
+    """
+
+    gamma: Tensor | None
+    contrast: Tensor | None
+
+    def __init__(self, gamma: Tensor | float | None = None, contrast: Tensor | float | None = None) -> None:
+        super().__init__()
+        bounds = {"gamma": (gamma, 0.1, 10.0), "contrast": (contrast, -0.49, 0.49)}
+        held = {name: _within(value, name, low, high) for name, (value, low, high) in bounds.items()}
+        hold(self, **held)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) linear sRGB to coded sRGB in [0,1]."""
-        return tone_curve(signal)
+        return tone_curve(signal, gamma=self.gamma, contrast=self.contrast)
+
+
+def _within(value: Tensor | float | None, name: str, low: float, high: float) -> Tensor | None:
+    """One number, or one for each of three channels, as a tensor."""
+    if value is None:
+        return None
+    expected = f"a number from {low:g} to {high:g}, or three of them, such as torch.full((3,), {(low + high) / 2:g})"
+    value = value if isinstance(value, Tensor) else as_numbers(value, name=name, expected=expected)
+    if value.shape not in ((), (3,)) or not bool(((value >= low) & (value <= high)).all()):
+        raise ValueError(f"{name} must be {expected}, got {value.tolist()}.")
+    return value
 
 
 class Clip(Stage):

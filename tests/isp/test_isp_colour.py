@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from skimage.color import deltaE_ciede2000
 from torch import Tensor, nn
 
-from kcam import isp, sensor, spectral
+from kcam import Camera, isp, sensor, spectral
 from kcam.context import Context
 from kcam.isp.colour import LEAST_WHITE
 from kcam.sensor import ColourFilter
@@ -154,6 +157,60 @@ class TestToneCurve:
         inside = torch.rand(1, 3, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.05
         assert torch.autograd.gradcheck(isp.tone_curve, (inside.requires_grad_(),))
         assert torch.autograd.gradcheck(isp.tone_curve, (inside[:, :1].detach().requires_grad_(),))
+
+    def test_gamma_and_contrast_follow_their_equation(self, dtype: torch.dtype) -> None:
+        x = torch.rand(2, 3, 4, 5, dtype=dtype, generator=torch.Generator().manual_seed(0))
+        gamma, contrast = [0.7, 1.0, 1.6], [-0.3, 0.0, 0.4]
+        result = isp.ToneCurve(torch.tensor(gamma), torch.tensor(contrast))(x)
+        assert result.dtype == dtype
+        for channel, (g, c) in enumerate(zip(gamma, contrast, strict=True)):
+            v = isp.tone_curve(x)[:, channel].double()
+            u = ((v + 0.01) ** g - 0.01**g) / (1.01**g - 0.01**g)
+            expected = u + 2 * c * u * (1 - u) * (2 * u - 1)
+            torch.testing.assert_close(result[:, channel].double(), expected, atol=2e-6, rtol=0)
+        torch.testing.assert_close(isp.ToneCurve(torch.ones(3), 0.0)(x), isp.ToneCurve()(x), atol=2e-6, rtol=0)
+        torch.testing.assert_close(isp.ToneCurve(gamma=1.6)(x[:, :1]), isp.ToneCurve([1.6] * 3)(x)[:, :1])
+
+    def test_gamma_and_contrast_train_and_come_back(self) -> None:
+        g = torch.Generator().manual_seed(0)
+        x = (0.05 + 0.9 * torch.rand(1, 3, 2, 3, dtype=torch.float64, generator=g)).requires_grad_()
+        gamma = torch.tensor([0.8, 1.0, 1.7], dtype=torch.float64, requires_grad=True)
+        contrast = torch.tensor([-0.2, 0.0, 0.3], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(lambda x, g, c: isp.tone_curve(x, gamma=g, contrast=c), (x, gamma, contrast))
+        gone = nn.Parameter(torch.tensor([-3.0, 50.0, 1.0]))  # as a training step of any size may leave it
+        stage = isp.ToneCurve(nn.Parameter(torch.ones(3)))
+        stage.gamma = gone
+        bright, dark, _ = stage(x.detach()).unbind(1)
+        assert bright.isfinite().all()
+        assert dark.isfinite().all()
+        (bright.sum() + (1 - dark).sum()).backward()  # to descend: darker red, brighter green
+        assert gone.grad is not None
+        assert gone.grad[0] < 0 < gone.grad[1]
+
+    @pytest.mark.parametrize(
+        ("arguments", "match"),
+        [
+            ({"gamma": 0.0}, "gamma must be a number from 0.1 to 10, or three of them"),
+            ({"gamma": math.nan}, "gamma must be .* got nan"),
+            ({"contrast": torch.ones(3)}, "contrast must be a number from -0.49 to 0.49"),
+            ({"gamma": torch.ones(4)}, "gamma must be"),
+        ],
+    )
+    def test_a_rendering_that_is_none(self, arguments: dict, match: str) -> None:
+        with pytest.raises(ValueError, match=match):
+            isp.ToneCurve(**arguments)
+
+    def test_three_gammas_for_one_channel(self) -> None:
+        with pytest.raises(ValueError, match="three channels do not fit one of gray"):
+            isp.ToneCurve(torch.ones(3))(torch.zeros(1, 1, 2, 2))
+
+    def test_a_trained_rendering_is_saved(self, tmp_path: Path) -> None:
+        gamma = nn.Parameter(torch.tensor([0.9, 1.0, 1.2]))
+        Camera(isp.ToneCurve(gamma, contrast=0.1)).save(tmp_path / "c.safetensors")
+        (stage,) = Camera.load(tmp_path / "c.safetensors")
+        assert isinstance(stage.gamma, nn.Parameter)
+        assert stage.gamma.tolist() == pytest.approx([0.9, 1.0, 1.2])
+        assert float(stage.contrast) == pytest.approx(0.1)
 
     def test_clip(self) -> None:
         x = torch.tensor([-1.0, 0.5, 2.0], requires_grad=True)
