@@ -360,6 +360,7 @@ def train(
     """Train a camera to take its pictures in the manner of a painting."""
     with one_line_errors():
         from kcam import train as module
+        from kcam.style import TrainingError
 
         options = module.Options(
             style=style,
@@ -381,13 +382,16 @@ def train(
         )
         leads = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun starts, one speaks
         with training_progress() as advance:
-            trained = module.run(
-                options,
-                resume=resume,
-                threads=threads or None,
-                advance=advance if leads else None,
-                say=err.print if leads else lambda text: None,
-            )
+            try:
+                trained = module.run(
+                    options,
+                    resume=resume,
+                    threads=threads or None,
+                    advance=advance if leads else None,
+                    say=lambda text: err.print(text, markup=False) if leads else None,
+                )
+            except TrainingError as error:
+                raise ValueError(str(error)) from error
         if profile and leads:
             done = sum(trained.profile.values())
             for part, seconds in trained.profile.items():
@@ -437,19 +441,21 @@ def paint(
     features: FeaturesOption = "steerable",
     vgg_weights: WeightsOption = "",
     style_size: StyleSizeOption = 0,
-    size: Annotated[int, typer.Option("--size", min=64, help="longer side of the painting [pixels]")] = 512,
+    size: Annotated[int, typer.Option("--size", min=64, help="longer side of the painting, at most [pixels]")] = 512,
     steps: Annotated[int, typer.Option("--steps", min=1, help="of the optimiser")] = 200,
     content: Annotated[float, typer.Option("--content", min=0.0, help="weight of what the photo shows")] = 0.3,
     seed: SeedOption = 0,
 ) -> None:
     """Paint a photograph in the manner of a style, or a texture of the style: the picture itself is optimised."""
     with one_line_errors():
-        from kcam import plots, train
+        from kcam import files, plots, train
         from kcam.scene import read_picture
         from kcam.style import StyleLoss
         from kcam.style import paint as optimise
 
         plots.check_writable(out)
+        for given in (photo, style):
+            files.check_other(out, given)
         picture = train.style_picture(style, size=style_size or None)
         layers = train.style_features(features, vgg_weights or None)
         loss = StyleLoss(picture, features=layers, content=content if photo else 0.0, colour=1.0)

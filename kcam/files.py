@@ -254,6 +254,12 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return document, tensors
 
 
+def check_other(path: str | os.PathLike[str], given: str | os.PathLike[str] | None) -> None:
+    """ValueError where a file that will be written is the one that is read."""
+    if given and Path(path).exists() and Path(given).exists() and Path(path).samefile(given):
+        raise ValueError(f"{path} is what is read, and would be lost. Choose another name for --out.")
+
+
 def replace(path: str | os.PathLike[str], content: bytes) -> None:
     """Write beside the file, then take its place: a crash or a full disk leaves the old file whole."""
     with replacing(path) as temporary:

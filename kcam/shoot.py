@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from kcam import optics, plots
+from kcam import files, optics, plots
 from kcam.camera import Camera
 from kcam.scene import Scene
 
@@ -51,8 +51,7 @@ def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     for photo, target in pairs:
         if not photo.is_file():
             raise FileNotFoundError(f"there is no file {photo}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
-        if target.exists() and target.samefile(photo):
-            raise ValueError(f"{target} is the photo itself, which would be lost. Choose another name for --out.")
+        files.check_other(target, photo)
     return pairs
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import os
 import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from torch import Tensor
 from kcam import __version__, files, isp, plots, report, style
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
+
+fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 
 SHOWN = ("astronaut", "coffee", "chelsea")
 SHOWN_SIZE = 192
@@ -74,7 +77,7 @@ def shrunk(picture: Tensor, size: int) -> Tensor:
     """A picture (3,H,W) whose longer side has at most `size` pixels; colours are filtered in linear light."""
     if max(picture.shape[-2:]) <= size:
         return picture.contiguous()
-    return Scene.from_rgb(picture).resized(size).to_srgb()[0]
+    return Scene.from_rgb(picture).resized(size).to_srgb()[0].clamp(0, 1)
 
 
 def run(
@@ -96,10 +99,10 @@ def run(
     Raises:    as `kcam.style.fit`; ValueError for options that do not fit together or another run's folder.
     """
     out = Path(options.out)
-    if out.suffix != ".safetensors":
-        raise ValueError(f"cannot write {out.name}: a camera's name ends in .safetensors.")
-    if not out.absolute().parent.is_dir():
-        raise FileNotFoundError(f"cannot write {out.name}: there is no folder {out.parent}.")
+    plots.check_writable(out, suffixes=(".safetensors",))
+    files.check_other(out, options.camera)
+    if options.device not in ("cpu", "cuda") or (options.device == "cuda" and not torch.cuda.is_available()):
+        raise ValueError(f'cannot train on "{options.device}": expected cpu, or cuda where torch finds a GPU.')
     folder = out.with_suffix("")
     if options.preset not in style.PRESETS:
         raise ValueError(f'unknown preset "{options.preset}"; there are: {", ".join(style.PRESETS)}.')
@@ -107,8 +110,11 @@ def run(
     features = style_features(options.features, options.vgg_weights)
     document: dict[str, Any] = {"options": asdict(options), "style": _hash(picture)}
     document["threads"] = _threads(folder, resume, threads)
-    with _threads_set(document["threads"]), _processes(options.device) as (leads, device):
+    with ExitStack() as stack:
+        stack.enter_context(_threads_set(document["threads"]))
+        leads, device = stack.enter_context(_processes(options.device))
         if leads:  # the others would meet what this one has begun to write
+            stack.enter_context(_alone(folder))
             _check_folder(folder, document, resume=resume)
         preset = style.PRESETS[options.preset]
         camera = _camera(options, preset).to(device)
@@ -124,7 +130,6 @@ def run(
         start = _camera(options, preset)
         scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0).to(device=device) for name in SHOWN]
         if leads:
-            folder.mkdir(exist_ok=True)
             settled = document | {"settings": asdict(settings), "kcam": __version__, "torch": torch.__version__}
             files.replace(folder / "config.json", (json.dumps(settled, indent=1) + "\n").encode())
 
@@ -214,16 +219,36 @@ def _hash(picture: Tensor) -> str:
     return hashlib.sha256(picture.contiguous().numpy().tobytes()).hexdigest()[:16]
 
 
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a run's folder, which is made if need be, so that no other process writes there."""
+    folder.mkdir(exist_ok=True)
+    if fcntl is None:
+        yield
+        return
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise ValueError(f"another process is training in {folder}. Wait for it, or choose another --out.") from None
+    finally:
+        os.close(held)
+
+
 def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> None:
-    """A folder holds one run: it goes on with the options that it began with."""
+    """A folder holds one run: it goes on with the options that it began with, under whatever name.
+
+    One that failed before its first checkpoint has not begun.
+    """
     found = folder / "config.json"
-    if not found.exists():
+    if not found.exists() or not any((folder / "checkpoints").glob("step-*")):
         return
     there = json.loads(found.read_text())
     if not resume:
         raise ValueError(f"{folder} holds a run. Go on with --resume, choose another --out, or remove the folder.")
     for name, value in document["options"].items():
-        if there["options"].get(name) != value:
+        if name != "out" and there["options"].get(name) != value:
             raise ValueError(
                 f"{folder} was begun with {name} = {there['options'].get(name)!r}, not {value!r}. Use the same options."
             )

@@ -170,7 +170,7 @@ def test_shoot_bad_input(photo: Path, tmp_path: Path) -> None:
 def test_shoot_never_writes_over_the_photo(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = photo.read_bytes()
     monkeypatch.chdir(tmp_path)  # the same file by another name
-    assert "photo.jpg is the photo itself" in fails("shoot", photo, "--camera", "ideal", "--out", "photo.jpg")
+    assert "photo.jpg is what is read" in fails("shoot", photo, "--camera", "ideal", "--out", "photo.jpg")
     assert photo.read_bytes() == before
 
 

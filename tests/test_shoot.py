@@ -173,12 +173,12 @@ def test_a_folder_without_pictures(inside: tuple[str, ...], tmp_path: Path) -> N
 @pytest.mark.usefixtures("never")
 def test_out_is_the_photo(folder: Path, tmp_path: Path) -> None:
     before = (folder / "b.PNG").read_bytes()
-    assert "b.PNG is the photo itself" in fails("shoot", folder / "b.PNG", "--out", folder / "b.PNG")
+    assert "b.PNG is what is read" in fails("shoot", folder / "b.PNG", "--out", folder / "b.PNG")
     photo = make_photo(tmp_path / "photo.png")
-    assert "is the photo itself, which would be lost" in fails("shoot", photo, "--out", tmp_path)
-    assert "is the photo itself" in fails("shoot", photo, folder / "a.jpg", "--out", tmp_path)
+    assert "is what is read, and would be lost" in fails("shoot", photo, "--out", tmp_path)
+    assert "is what is read" in fails("shoot", photo, folder / "a.jpg", "--out", tmp_path)
     (tmp_path / "link.png").symlink_to(photo)
-    assert "is the photo itself" in fails("shoot", photo, "--out", tmp_path / "link.png")
+    assert "is what is read" in fails("shoot", photo, "--out", tmp_path / "link.png")
     assert (folder / "b.PNG").read_bytes() == before
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,7 @@ from kcam import files, isp, plots, train
 from kcam.camera import Camera
 from kcam.cli import app
 from kcam.scene import Scene
-from kcam.style import painting
+from kcam.style import TrainingError, painting, style_camera
 
 CHOSEN = {"stage": False, "steps": 3, "size": 64, "batch": 1}
 
@@ -121,7 +123,8 @@ def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None
         ({"style_size": 32}, r"a style of 32 x 32 is too small"),
         ({"patches": "nowhere"}, r"nowhere"),
         ({"camera": "nothing.safetensors"}, r"there is no file nothing.safetensors"),
-        ({"out": "styled.pt"}, r"cannot write styled.pt: a camera's name ends in .safetensors"),
+        ({"out": "styled.pt"}, r"cannot write styled.pt: its name must end in one of .safetensors"),
+        ({"device": "abacus"}, r'cannot train on "abacus": expected cpu, or cuda where torch finds a GPU'),
         ({"out": "/nowhere/at/all.safetensors"}, r"there is no folder /nowhere/at"),
     ],
 )
@@ -130,6 +133,60 @@ def test_errors(tmp_path: Path, monkeypatch, changes: dict, match: str) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=match):
         run(Path(changes.pop("out", "a.safetensors")), **changes)
     assert not (tmp_path / "a.safetensors").exists()
+
+
+def test_a_run_that_could_not_begin_leaves_its_name_free(tmp_path: Path, monkeypatch) -> None:
+    without_pictures(monkeypatch)
+    out = tmp_path / "a.safetensors"
+    with pytest.raises(ValueError, match="100 x 100 has no features"):
+        run(out, size=100, steps=1)
+    assert run(out, size=64, steps=1)[0].finished
+    moved = tmp_path / "b.safetensors"
+    out.with_suffix("").rename(moved.with_suffix(""))
+    assert run(moved, size=64, steps=1, resume=True)[0].finished  # under another name
+
+
+def test_nothing_that_is_read_is_written_over(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    camera, photo = tmp_path / "mine.safetensors", tmp_path / "photo.png"
+    style_camera(stage=False).save(camera)
+    plots.write_picture(torch.full((3, 64, 64), 0.5), photo)
+    kept = camera.read_bytes(), photo.read_bytes()
+    with pytest.raises(ValueError, match="is what is read, and would be lost"):
+        run(camera, camera=str(camera))
+    for command in ("paint photo.png --out ./photo.png", "paint --style photo.png --out photo.png"):
+        result = invoke(command)
+        assert result.exit_code == 2
+        assert "is what is read, and would be lost" in " ".join(result.output.split())
+    (tmp_path / "folder.safetensors").mkdir()
+    with pytest.raises(ValueError, match="there is a folder of that name"):
+        run(tmp_path / "folder.safetensors")
+    assert (camera.read_bytes(), photo.read_bytes()) == kept
+
+
+@pytest.mark.skipif(train.fcntl is None, reason="POSIX alone holds folders")
+def test_one_process_trains_in_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    folder.mkdir()
+    script = "import fcntl, os, sys; fcntl.flock(os.open(sys.argv[1], 0), fcntl.LOCK_EX); print(flush=True); input()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", script, folder], **pipes) as other:
+        other.stdout.readline()
+        with pytest.raises(ValueError, match="another process is training in"):
+            run(tmp_path / "a.safetensors")
+        other.communicate(b"\n")
+
+
+def test_a_run_that_diverges_is_one_line(tmp_path: Path, monkeypatch) -> None:
+    def diverge(*arguments, **named):
+        named["say"]("a name in brackets: [/b]")  # is no markup
+        raise TrainingError("training stopped at step 3: the style term is nan.")
+
+    monkeypatch.setattr(train, "run", diverge)
+    result = invoke(f"train woodcut --out {tmp_path / 'a.safetensors'}")
+    assert result.exit_code == 2
+    assert result.output.endswith("kcam: training stopped at step 3: the style term is nan.\n")
+    assert "[/b]" in result.output
 
 
 def test_a_gray_style_and_a_smaller_one(tmp_path: Path) -> None:

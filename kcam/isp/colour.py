@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from kornia.color import linear_rgb_to_rgb
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcam import spectral
 from kcam.context import Context, Stage
@@ -201,6 +201,9 @@ class ColourMatrix(Stage):
         return 3
 
 
+GAMMAS, CONTRASTS = (0.1, 10.0), (-0.49, 0.49)
+
+
 def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor | None = None) -> Tensor:
     """Linear sRGB to coded sRGB: clipped to 0..1, then the sRGB transfer function of IEC 61966-2-1.
 
@@ -242,7 +245,7 @@ def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
     Args:      signal: any shape.  gamma: above 1 darkens; taken as 0.1 to 10.  contrast: c, taken as -0.49 to 0.49.
                Beyond these bounds the gradients of both are those of `clip_ste`. They broadcast against the signal.
     """
-    gamma, contrast = clip_ste(gamma, 0.1, 10.0), clip_ste(contrast, -0.49, 0.49)
+    gamma, contrast = clip_ste(gamma, *GAMMAS), clip_ste(contrast, *CONTRASTS)
     offset = 0.01
     low = offset**gamma
     tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
@@ -254,7 +257,8 @@ class ToneCurve(Stage):
 
     Args:      gamma, contrast: numbers or tensors, 0-d or (3,) for red, green and blue; an nn.Parameter trains, such
                as nn.Parameter(torch.ones(3)) and nn.Parameter(torch.zeros(3)), which change nothing. None: 1 and 0.
-    Raises:    TypeError, ValueError for other shapes, a gamma outside 0.1..10, or a contrast outside -0.49..0.49.
+    Raises:    TypeError, ValueError for other shapes, a gamma outside 0.1..10, or a contrast outside -0.49..0.49, but
+               for an nn.Parameter, which is taken as the bound that it was trained beyond.
     """
 
     gamma: Tensor | None
@@ -262,7 +266,7 @@ class ToneCurve(Stage):
 
     def __init__(self, gamma: Tensor | float | None = None, contrast: Tensor | float | None = None) -> None:
         super().__init__()
-        bounds = {"gamma": (gamma, 0.1, 10.0), "contrast": (contrast, -0.49, 0.49)}
+        bounds = {"gamma": (gamma, *GAMMAS), "contrast": (contrast, *CONTRASTS)}
         held = {name: _within(value, name, low, high) for name, (value, low, high) in bounds.items()}
         hold(self, **held)
 
@@ -277,7 +281,8 @@ def _within(value: Tensor | float | None, name: str, low: float, high: float) ->
         return None
     expected = f"a number from {low:g} to {high:g}, or three of them, such as torch.full((3,), {(low + high) / 2:g})"
     value = value if isinstance(value, Tensor) else as_numbers(value, name=name, expected=expected)
-    if value.shape not in ((), (3,)) or not bool(((value >= low) & (value <= high)).all()):
+    inside = bool(((value >= low) & (value <= high)).all()) or isinstance(value, nn.Parameter)  # training may leave it
+    if value.shape not in ((), (3,)) or not inside:
         raise ValueError(f"{name} must be {expected}, got {value.tolist()}.")
     return value
 

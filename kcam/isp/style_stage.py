@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -28,7 +29,9 @@ WINDOWS = 4
 DARKEST = 0.03
 """What black is taken for, and 1 - 0.03 for white, so that strokes can lie on them: the logit has no bound."""
 FURTHEST = 4.0
-"""Bound of the result's logit, 0.018 and 0.982: beyond it the sigmoid has no gradient that would bring it back."""
+"""Bound of the result's logit: beyond it the sigmoid has no gradient that would bring it back."""
+LEAST_SHOWN = 1 / (1 + math.exp(FURTHEST))
+"""0.018, the darkest that a stage paints; 0.982 is the brightest."""
 
 
 class _Conv(nn.Conv2d):
@@ -101,7 +104,8 @@ class StyleStage(Stage):
                noise at a quarter of the size.
                level: of the noise, 1.0 as trained; 0 for none.
     Raises:    ValueError for a width or a dilation below 1, anything but three numbers of planes >= 0, a level that is
-               negative or not finite, and at the call for another number of channels than 3.
+               negative or not finite, and at the call for another number of channels than 3; TypeError at the call for
+               pictures of whole numbers.
     Source:    Johnson, Alahi and Fei-Fei, Perceptual losses for real-time style transfer and super-resolution (2016);
                Ulyanov et al., Texture networks (2016), the noise; instance normalisation (2016); Cabral and Leedom,
                Imaging vector fields using line integral convolution (1993), noise drawn out along a flow.
@@ -157,10 +161,8 @@ class StyleStage(Stage):
 
     def mean(self) -> StyleStage:
         """The stage without its noise: one picture of those that it paints, not their mean. Shares the weights."""
-        quiet = StyleStage(width=self.width, dilations=self.dilations, noise=self.noise, level=0.0)
-        quiet.colour = self.colour
-        for name, module in self.named_children():
-            setattr(quiet, name, module)
+        quiet = copy.copy(self)
+        quiet.level = 0.0
         return quiet
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
@@ -169,6 +171,8 @@ class StyleStage(Stage):
             raise ValueError(
                 f"StyleStage repaints pictures (B,3,H,W), got shape {tuple(signal.shape)}. Put it behind the ToneCurve."
             )
+        if not signal.is_floating_point():
+            raise TypeError(f"StyleStage repaints pictures in [0,1], got {signal.dtype}. Use picture / 255.")
         if signal.numel() == 0:
             return signal
         height, width = signal.shape[-2:]

@@ -104,7 +104,10 @@ class SteerableFeatures(nn.Module):
         """The filters of each scale, (6,h,w)."""
         key = (*y.shape[-2:], y.dtype, y.device)
         if key not in self._filters:
-            self._filters[key] = [_filters(*y.shape[-2:], scale=scale).to(y) for scale in range(SCALES)]
+            with torch.inference_mode(False):  # what is kept must serve training too
+                self._filters[key] = [
+                    _filters(*y.shape[-2:], scale=scale).to(y.device, y.dtype) for scale in range(SCALES)
+                ]
         return self._filters[key]
 
 

@@ -322,19 +322,24 @@ class StyleLoss(nn.Module):
         return content_loss(layers[self.content_layer], target)
 
 
+def check_picture(picture: Tensor, *, name: str) -> None:
+    """TypeError, ValueError unless it is a picture (3,H,W) with values in [0,1]."""
+    if not isinstance(picture, Tensor) or not picture.is_floating_point():
+        got = picture.dtype if isinstance(picture, Tensor) else type(picture).__name__
+        raise TypeError(f"{name} is a floating-point picture (3,H,W) in [0,1], got {got}.")
+    if picture.ndim != 3 or picture.shape[0] != 3 or picture.numel() == 0:
+        raise ValueError(f"{name} is one picture (3,H,W), got shape {tuple(picture.shape)}.")
+    low, high = (value.item() for value in picture.detach().aminmax())
+    if not (low >= 0 and high <= 1):
+        raise ValueError(f"{name} has values in [0,1], got {low:g} to {high:g}. Use picture.clamp(0, 1), or / 255.")
+
+
 def style_crops(picture: Tensor, *, side: int | None, multiple: int, least: int, most: int = 64) -> Tensor:
     """Crops that cover a style picture evenly, (N,3,s,s): at its own pixels, at most `most` of them.
 
     Raises:    TypeError, ValueError for what is no picture in [0,1], or one that is smaller than the features ask.
     """
-    if not isinstance(picture, Tensor) or not picture.is_floating_point():
-        got = picture.dtype if isinstance(picture, Tensor) else type(picture).__name__
-        raise TypeError(f"a style is a floating-point picture (3,H,W) in [0,1], got {got}.")
-    if picture.ndim != 3 or picture.shape[0] != 3:
-        raise ValueError(f"a style is one picture (3,H,W), got shape {tuple(picture.shape)}.")
-    low, high = (value.item() for value in picture.detach().aminmax())
-    if not (low >= 0 and high <= 1):
-        raise ValueError(f"a style has values in [0,1], got {low:g} to {high:g}. Use picture.clamp(0, 1), or / 255.")
+    check_picture(picture, name="a style")
     if side is not None and side < least:
         raise ValueError(f"crops of {side} pixels are too small: the features need at least {least}. Use crop={least}.")
     shorter = min(picture.shape[-2:])

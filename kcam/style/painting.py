@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from kcam.ste import clip_ste
 from kcam.style.draws import torch_generator
-from kcam.style.losses import StyleLoss
+from kcam.style.losses import StyleLoss, check_picture
 
 STARTS = ("photo", "noise")
 NOISE = 0.15  # RMS of the white noise that a picture may start from, around gray
@@ -56,8 +56,8 @@ def paint(
         raise ValueError("a texture needs a size: pass shape=(256, 256), or a photo to paint.")
     if photo is None and (loss.weights["content"] or loss.weights["l2"]):
         raise ValueError("there is no photo for the content to be compared with. Pass StyleLoss(..., content=0).")
-    if photo is not None and (photo.ndim != 3 or photo.shape[0] != 3):
-        raise ValueError(f"a photo is one picture (3,H,W), got shape {tuple(photo.shape)}.")
+    if photo is not None:
+        check_picture(photo, name="a photo")
     height, width = photo.shape[-2:] if photo is not None else shape or (0, 0)
     multiple, least = (int(size) for size in (loss.features.multiple, loss.features.least))
     rows, columns = (max(least, math.ceil(size / multiple) * multiple) for size in (height, width))

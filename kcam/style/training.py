@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from kcam import isp, optics, sensor
 from kcam.camera import DEMOSAICING, Camera, is_random
 from kcam.context import Stage
+from kcam.isp.style_stage import LEAST_SHOWN
 from kcam.planner import Plan
 from kcam.scene import Scene
 from kcam.style.checkpoints import Checkpoints
@@ -67,7 +68,8 @@ class Settings:
     average: of the weights, that is what is exported: share of the past, 0 for the last weights as they are.
     every: steps between checkpoints.
     content_aim: None leaves the content term at its weight; else its weight follows, within a factor of 2, so that the
-        content loss itself settles here: strong strokes and faint ones then leave as much of the scene.
+        content loss itself settles here: strong strokes and faint ones then leave as much of the scene. For the loss by
+        correlation alone; that by features has another unit for each network.
     tolerance: None trains through the reference physics; else through a plan for the training scenes, which is frozen
         between checkpoints and made anew where it is measured to miss the tolerance: see `kcam.Plan`.
     """
@@ -94,11 +96,16 @@ class Settings:
         unknown = (set(self.rates) | set(self.decayed)) - set(PARTS)
         if unknown:
             raise ValueError(f"unknown part {sorted(unknown)[0]!r} of a camera; what trains: {', '.join(PARTS)}.")
-        for name in ("steps", "batch", "size", "every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if not all(0 <= rate < math.inf for rate in self.rates.values()):
-            raise ValueError(f"learning rates must be finite and >= 0, got {self.rates}.")
+        for name, least in {"steps": 1, "batch": 1, "size": 1, "every": 1, "warm_up": 0}.items():
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
+        for name in ("weight_decay", "final", "tolerance"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be a finite number >= 0, got {value!r}.")
+        if not all(0 <= rate < math.inf for rate in self.rates.values()) or not any(self.rates.values()):
+            raise ValueError(f"learning rates must be finite and >= 0, and one of them above, got {self.rates}.")
         if self.content_aim is not None and not 0 < self.content_aim < 2:
             raise ValueError(f"content_aim must be within 0..2, got {self.content_aim:g}. Use 0.16 or None.")
         if not self.clip > 0 or not 0 <= self.average < 1:
@@ -194,7 +201,8 @@ def photograph(
     Returns:   the pictures, and with `recorded` what the sensor records with and without optics, before any noise:
                the two sides of the thesis's L2 content loss (its figure 4.1).
     """
-    split = next((i for i, stage in enumerate(camera) if isinstance(stage, DEMOSAICING) or is_random(stage)), 0)
+    stops = (i for i, stage in enumerate(camera) if isinstance(stage, DEMOSAICING) or is_random(stage))
+    split = next(stops, len(camera))
     context = camera.resolve(scene)
     front = Camera(*camera.stages[:split], context=context)
     light = front(scene)
@@ -228,9 +236,11 @@ def fit(
     """Train a camera to take its pictures in the manner of a style.
 
     What is random is drawn by seed and step, so that a run that was killed goes on from its last checkpoint with the
-    same weights, bit for bit, on the same machine, torch and number of threads. Under torchrun each process takes its
-    rows of the batch, and torch's DistributedDataParallel averages their gradients: the curve is that of one process up
-    to rounding, which training makes grow, and until a Poisson draw of the shot noise falls the other way.
+    same weights, bit for bit, on the same machine, torch and number of threads. One exception: a run that was stopped
+    between two checkpoints and then meets a loss that is not finite goes back to where it was stopped. Under torchrun
+    each process takes its rows of the batch, and torch's DistributedDataParallel averages their gradients: the curve is
+    that of one process up to rounding, which training makes grow, and until a Poisson draw of the shot noise falls the
+    other way.
 
     Args:      camera: trains in place; its nn.Parameters in the parts with a learning rate.
                loss: the style.
@@ -368,7 +378,7 @@ class _Run:
     def _aim(self) -> None:
         """Move the content's weight towards what makes its loss the one that is aimed at."""
         aim = self.settings.content_aim
-        if aim is None or "content" not in self.names:
+        if aim is None or "content" not in self.names or self.loss.content_by != "correlation":
             return
         now = self.terms()["content"] / (self.emphasis * self.loss.weights["content"])
         past = AIM_MEMORY if self.step > 1 else 0.0
@@ -414,7 +424,8 @@ class _Run:
         shown = luminance(scene.to_srgb()).flatten(1)
         pairs = torch.stack([luminance(picture).flatten(1), shown], dim=1)
         alike = float(torch.stack([torch.corrcoef(pair)[0, 1] for pair in pairs]).nan_to_num(1.0).mean())
-        clipped = float(((picture <= 1 / 512) | (picture >= 1 - 1 / 512)).float().mean())
+        end = LEAST_SHOWN + 1e-3 if any(isinstance(s, isp.StyleStage) for s in self.camera) else 1 / 512
+        clipped = float(((picture <= end) | (picture >= 1 - end)).float().mean())
         curves = zip(self._responses(), self._white, strict=True)
         blind = [index for index, (now, start) in enumerate(curves) if now < DEAD * start]
         for key, happens, text in (
@@ -489,7 +500,8 @@ class _Run:
             "style": style,
             "loss": {"weights": loss.weights, "statistic": loss.statistic, "content_by": loss.content_by},
             "correlation": {"levels": list(loss.levels), "window": loss.window, "whole": loss.whole},
-            "features": self.loss.features.name,
+            "features": [loss.features.name, loss.content_layer],
+            "source": [type(self.source).__name__, len(self.source)],
             "parameters": {name: list(p.shape) for name, p in self.named.items()},
         }
 
@@ -498,8 +510,12 @@ class _Run:
         self._snapshot = self.state()
 
     def save(self) -> None:
-        """A checkpoint; a plan that no longer holds is made anew first, so that it is the one that is kept."""
-        self._make_plan()
+        """A checkpoint; a plan that no longer holds is made anew first, so that it is the one that is kept.
+
+        But not where a run was stopped in between: one that was not would have kept its plan.
+        """
+        if self.step % self.settings.every == 0:
+            self._make_plan()
         self.keep()
         if self.checkpoints is not None:
             self.checkpoints.save(self.step, tensors=self._snapshot["tensors"], document=self._snapshot["document"])

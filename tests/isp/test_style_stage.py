@@ -195,6 +195,11 @@ def test_stroke_kernels_turn_with_their_number() -> None:
     assert overlaps.max() < 1.02 * overlaps.min()  # one number serves all neighbours
 
 
+def test_whole_numbers_are_no_picture() -> None:
+    with pytest.raises(TypeError, match=r"got torch.uint8. Use picture / 255"):
+        StyleStage()(torch.full((1, 3, 8, 8), 200, dtype=torch.uint8))
+
+
 # ---- gradients ------------------------------------------------------------------------------------------------------
 
 

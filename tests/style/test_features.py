@@ -263,3 +263,27 @@ def test_synthesis_cuts_the_loss():
 def test_synthesis_cuts_the_loss_a_hundredfold(name: str):
     """In 200 steps: strokes 574, mosaic 466, woodcut 246, watercolour 1085 times."""
     assert reduction(name, size=128, steps=200) > 100
+
+
+def test_features_of_inference_serve_training_too() -> None:
+    features = SteerableFeatures()
+    picture = torch.full((1, 3, 80, 96), 0.5)
+    with torch.inference_mode():
+        features(picture)
+    picture.requires_grad_()
+    features(picture)["scale 0"].sum().backward()
+    assert picture.grad is not None
+
+
+@pytest.mark.parametrize(
+    ("photo", "error", "match"),
+    [
+        (torch.full((3, 80, 80), 200, dtype=torch.uint8), TypeError, "a photo is a floating-point picture"),
+        (torch.full((3, 80, 80), 200.0), ValueError, r"a photo has values in \[0,1\], got 200 to 200"),
+        (torch.full((3, 80, 80), math.nan), ValueError, r"a photo has values in \[0,1\], got nan"),
+        (torch.zeros(3, 0, 80), ValueError, r"a photo is one picture \(3,H,W\), got shape"),
+    ],
+)
+def test_paint_refuses_what_is_no_photo(photo: torch.Tensor, error: type[Exception], match: str) -> None:
+    with pytest.raises(error, match=match):
+        paint(StyleLoss(painting("woodcut", size=64)), photo=photo, steps=1)

@@ -108,6 +108,15 @@ def test_resume_refuses_another_run(tmp_path: Path) -> None:
         train(tmp_path, resume=True, steps=9)
     with pytest.raises(ValueError, match=r"loss.weights.content"):
         train(tmp_path, resume=True, loss=tiny.loss(content=0.7))
+    with pytest.raises(ValueError, match=r"its source is \['BuiltinScenes'"):
+        fit(
+            tiny.camera(),
+            tiny.loss(),
+            source=tiny.BuiltinScenes(tiny.SIZE, names=["chelsea", "coffee"]),
+            settings=tiny.settings(),
+            folder=tmp_path,
+            resume=True,
+        )
     with pytest.raises(ValueError, match=r"holds the checkpoints of a run. Go on with resume=True"):
         train(tmp_path)
 
@@ -215,6 +224,16 @@ def test_rows_do_not_depend_on_their_neighbours() -> None:
     assert (both[1] - alone[0]).abs().max() < 1e-5  # the transforms of a batch round otherwise
 
 
+def test_a_camera_without_noise_and_mosaic_sees_the_depth() -> None:
+    scene, _ = tiny.source().draw([0], seed=0, step=0)
+    scene = scene.with_depth(0.9)
+    kinds = isp.Demosaic, isp.Convolution, sensor.Mosaic, sensor.ShotNoise, sensor.ADC
+    camera = Camera(*(stage for stage in tiny.camera(stage=False) if not isinstance(stage, kinds)))
+    picture, _ = photograph(camera, scene, lambda row, stage: torch.Generator())
+    torch.testing.assert_close(picture, camera(scene))
+    assert (picture - camera(scene.with_depth(2.0))).abs().max() > 0.05
+
+
 def test_recorded_is_what_the_sensor_sees_with_and_without_optics() -> None:
     """The two sides of the thesis's content loss: for a camera without blur they are one."""
     scene, _ = tiny.source().draw([0], seed=0, step=0)
@@ -257,6 +276,23 @@ def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
     assert any("they clip" in str(w.message) for w in caught)
 
 
+def test_a_stage_that_paints_all_white_is_told(monkeypatch) -> None:
+    monkeypatch.setattr("kcam.style.training.LOOK", 2)
+    camera = tiny.camera()
+    with torch.no_grad():
+        camera[-1].leave.bias.fill_(100.0)
+    with pytest.warns(StyleWarning, match="100% of the pictures is black or white"):
+        fit(camera, tiny.loss(), source=tiny.source(), settings=tiny.settings(steps=2, rates={"filter": 1e-6}))
+
+
+def test_an_aim_is_for_the_correlation_alone(monkeypatch) -> None:
+    """A loss by features has another unit for each network: its weight stays."""
+    monkeypatch.setattr("kcam.style.training.AIMED_FROM", 0)
+    by_features = tiny.loss(content_by="features", content_layer="scale 1")
+    aimed, plain = (train(None, loss=by_features, content_aim=aim, steps=3).history for aim in (0.01, None))
+    assert torch.equal(aimed, plain)
+
+
 def test_a_channel_that_goes_blind_is_told(monkeypatch) -> None:
     monkeypatch.setattr("kcam.style.training.LOOK", 2)
     camera = tiny.camera(stage=False)
@@ -278,7 +314,13 @@ def test_a_channel_that_goes_blind_is_told(monkeypatch) -> None:
     ("changes", "match"),
     [
         ({"rates": {"lens": 1.0}}, r"unknown part 'lens' of a camera; what trains: optics, filter"),
-        ({"steps": 0}, r"steps must be at least 1, got 0"),
+        ({"steps": 0}, r"steps must be a whole number of at least 1, got 0"),
+        ({"steps": 1.5}, r"steps must be a whole number of at least 1, got 1.5"),
+        ({"warm_up": -5}, r"warm_up must be a whole number of at least 0, got -5"),
+        ({"final": -1.0}, r"final must be a finite number >= 0, got -1.0"),
+        ({"weight_decay": float("nan")}, r"weight_decay must be a finite number >= 0, got nan"),
+        ({"tolerance": -1.0}, r"tolerance must be a finite number >= 0, got -1.0"),
+        ({"rates": {"filter": 0.0}}, r"one of them above"),
         ({"rates": {"filter": float("nan")}}, r"learning rates must be finite"),
         ({"clip": 0.0}, r"expected clip > 0"),
         ({"average": 1.0}, r"0 <= average < 1"),
