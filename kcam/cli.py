@@ -424,7 +424,7 @@ def training_progress() -> Iterator[Callable[..., None]]:
                 whole = duration(each * steps)
                 if done == 5:
                     err.print(f"{each:.3g} s a step: {steps} steps take {whole}")
-                if not err.is_terminal and progress.step % 50 == 0:
+                if not err.is_terminal and progress.step % 50 == 0 and progress.step < steps:
                     err.print(f"step {progress.step} of {steps}, {left} left:  {terms}", markup=False)
 
         yield advance
