@@ -239,7 +239,7 @@ def fit(
     same weights, bit for bit, on the same machine, torch and number of threads. One exception: a run that was stopped
     between two checkpoints and then meets a loss that is not finite goes back to where it was stopped. Under torchrun
     each process takes its rows of the batch, and torch's DistributedDataParallel averages their gradients: the curve is
-    that of one process up to rounding, which training makes grow, and until a Poisson draw of the shot noise falls the
+    that of one process up to rounding, which training makes grow, and until a photon or a step of the ADC falls the
     other way.
 
     Args:      camera: trains in place; its nn.Parameters in the parts with a learning rate.

@@ -390,15 +390,14 @@ def test_killed_five_times_it_ends_in_the_same_camera(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_processes_give_the_curve_of_one(tmp_path: Path) -> None:
-    quiet = "--no-shot-noise"  # a Poisson draw that rounding turns over makes the rest another run: seen at step 15
-    run_process(tmp_path / "one", quiet)
+    smooth = "--smooth"  # a photon or an ADC's step that rounding turns over, and fast training, make another run of it
+    run_process(tmp_path / "one", smooth)
     run_process(
-        tmp_path / "two", quiet, launcher=("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
+        tmp_path / "two", smooth, launcher=("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
     )
     one, two = (torch.load(tmp_path / name / "result.pt", weights_only=True) for name in ("one", "two"))
-    # the first step differs by 3e-8, and training makes rounding grow: 1e-5 after 15 steps, 2e-3 after 30
-    assert torch.allclose(one["history"][:1], two["history"][:1], rtol=1e-6)
-    assert torch.allclose(one["history"][:12], two["history"][:12], rtol=1e-4)
+    assert len(one["history"]) == 30
+    assert torch.allclose(one["history"], two["history"], rtol=1e-4)  # measured: 3e-6
 
 
 def test_a_batch_that_the_processes_cannot_share(monkeypatch) -> None:

@@ -8,7 +8,9 @@ from pathlib import Path
 import tiny
 import torch
 
-from kcam.style import fit
+from kcam.style import Settings, fit
+
+SLOW = {part: rate / 10 for part, rate in Settings().rates.items()}
 
 
 def main() -> None:
@@ -19,10 +21,10 @@ def main() -> None:
     if distributed:
         torch.distributed.init_process_group("gloo")
     trained = fit(
-        tiny.camera(shot_noise="--no-shot-noise" not in sys.argv),
+        tiny.camera(photons="--smooth" not in sys.argv),
         tiny.loss(),
         source=tiny.source(),
-        settings=tiny.settings(steps=30, every=2),
+        settings=tiny.settings(steps=30, every=2, rates=SLOW if "--smooth" in sys.argv else Settings().rates),
         folder=folder / "checkpoints",
         resume="--resume" in sys.argv,
     )
