@@ -134,6 +134,7 @@ def test_the_truth_is_the_diffraction_integral_in_two_dimensions(case):
     torch.testing.assert_close(peers.truth(case), torch.from_numpy(image) * case.pitch**2, rtol=1e-9, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_hard_cases_of_kcam_end_in_the_right_picture_or_an_error():
     rows = peers.hard_rows([])
     assert len({row["case"] for row in rows}) == 5
@@ -177,6 +178,7 @@ def augmented(tmp_path_factory: pytest.TempPathFactory) -> dict:
     return json.loads(path.read_text())
 
 
+@pytest.mark.slow
 def test_every_augmentation_is_raced_on_pictures_and_cubes(augmented):
     names = {name for name in KC.__all__ if name.startswith("Random")}
     for channels, without in ((3, set()), (28, {"RandomColourMatrix"})):
