@@ -190,6 +190,7 @@ def test_every_augmentation_is_raced_on_pictures_and_cubes(augmented):
             assert ("0.5" in line["added"]) == (channels == 3 or name not in {"RandomBayer", "RandomCamera"})
 
 
+@pytest.mark.slow
 def test_the_straightforward_way_gives_the_same_picture(augmented):
     exact = [line for line in augmented["lines"] if line["difference"] is not None]
     assert len(exact) == 2 * 12 - 1
