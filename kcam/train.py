@@ -228,10 +228,12 @@ def _alone(folder: Path) -> Iterator[None]:
         return
     held = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError:
-        raise ValueError(f"another process is training in {folder}. Wait for it, or choose another --out.") from None
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            message = f"another process is training in {folder}. Wait for it, or choose another --out."
+            raise ValueError(message) from None
+        yield  # outside of the clause: what goes wrong in training is not the lock
     finally:
         os.close(held)
 

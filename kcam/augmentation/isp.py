@@ -8,6 +8,7 @@ from torch import Tensor
 from kcam.augmentation.base import CameraAugmentation, wavelengths_of
 from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
 from kcam.isp import apply_colour_matrix, render_tones
+from kcam.isp.colour import CONTRASTS, GAMMAS
 from kcam.units import nm, wavelength_grid
 
 DAYLIGHT = 6504.0  # K, the correlated colour temperature of D65
@@ -130,8 +131,8 @@ class RandomToneCurve(CameraAugmentation):
         keepdim: bool = False,
     ) -> None:
         draws: dict[str, Draw] = {
-            "gamma": Uniform(gamma, "log", least=0.1, most=10.0),
-            "contrast": Uniform(contrast, least=-0.49, most=0.49),
+            "gamma": Uniform(gamma, "log", least=GAMMAS[0], most=GAMMAS[1]),
+            "contrast": Uniform(contrast, least=CONTRASTS[0], most=CONTRASTS[1]),
         }
         super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
 

@@ -212,7 +212,8 @@ def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor 
 
     With a gamma or a contrast another rendering of these tones follows: `render_tones`.
 
-    Args:      signal: (..., 3, H, W), or one channel of gray.  gamma, contrast: 0-d, or one for each channel.
+    Args:      signal: (..., 3, H, W), or one channel of gray.  gamma, contrast: 0-d, or one for each channel; taken as
+               0.1 to 10 and -0.49 to 0.49, with the gradients of `clip_ste` beyond.
     Returns:   same shape, in [0,1]. The gradient is finite everywhere; beyond the clip it is that of `clip_ste`.
     Raises:    ValueError for another number of channels.
     """
@@ -232,7 +233,7 @@ def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor 
     if any(value.numel() not in (1, channels) for value in held):
         raise ValueError(f"gamma and contrast of three channels do not fit one of gray, {tuple(signal.shape)}.")
     gamma, contrast = (value.to(coded)[..., None, None] for value in held)
-    return render_tones(coded, gamma=gamma, contrast=contrast)
+    return render_tones(coded, gamma=clip_ste(gamma, *GAMMAS), contrast=clip_ste(contrast, *CONTRASTS))
 
 
 def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
@@ -242,10 +243,9 @@ def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
 
     Both keep black at 0 and white at 1 and rise everywhere; e keeps the slope at black finite.
 
-    Args:      signal: any shape.  gamma: above 1 darkens; taken as 0.1 to 10.  contrast: c, taken as -0.49 to 0.49.
-               Beyond these bounds the gradients of both are those of `clip_ste`. They broadcast against the signal.
+    Args:      signal: any shape.  gamma: 0.1 to 10, above 1 darkens.  contrast: c, -0.49 to 0.49. Both broadcast
+               against the signal, and are not checked.
     """
-    gamma, contrast = clip_ste(gamma, *GAMMAS), clip_ste(contrast, *CONTRASTS)
     offset = 0.01
     low = offset**gamma
     tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
