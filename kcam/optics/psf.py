@@ -46,6 +46,7 @@ from kcam.optics.transforms import (
     fast_length,
     mean_slope,
     pupil_intensity,
+    sines,
 )
 from kcam.optics.warp import Warp
 
@@ -507,7 +508,7 @@ def _pixel_field(query: Query, cells: _Cells, *, count: int, spacing: float, cur
 
     def both(tau: float) -> Tensor:
         onto = _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved)
-        return torch.stack(_PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto))
+        return _PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto)
 
     re, im = _following(query.tau, both, spacing=spacing)
     return re, im
@@ -539,35 +540,32 @@ class _Warped:
 
 
 class _PixelField(torch.autograd.Function):
-    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength; no sines are kept for the backward
-    pass.
+    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength, real and imaginary part (2, L, N, N);
+    no sines are kept for the backward pass.
     """
 
     @staticmethod
     def forward(ctx, phases, factors, amplitude, weights):
         ctx.save_for_backward(phases, factors, amplitude)
         ctx.weights = weights
-        parts: tuple[list[Tensor], list[Tensor]] = ([], [])
-        for factor in factors.T:
-            for part, values in zip(parts, _sines(factor, phases), strict=True):
-                part.append(weights.forward(values.mul_(amplitude)))
-        return torch.stack(parts[0]), torch.stack(parts[1])
+        grids = [weights.forward(values.mul_(amplitude)) for factor in factors.T for values in _sines(factor, phases)]
+        return torch.stack(grids[::2] + grids[1::2]).unflatten(0, (2, -1))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad_re, grad_im):
+    def backward(ctx, grad):
         phases, factors, amplitude = ctx.saved_tensors
         d_phases = torch.zeros_like(phases)
-        d_amplitude = torch.zeros_like(amplitude)
-        for factor, re, im in zip(factors.T, grad_re, grad_im, strict=True):
-            onto_re, onto_im = ctx.weights.adjoint(re), ctx.weights.adjoint(im)
+        d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
+        for index, factor in enumerate(factors.T):
+            onto_re, onto_im = (ctx.weights.adjoint(part[index]) for part in grad)
             cosine, sine = _sines(factor, phases)
-            if ctx.needs_input_grad[2]:
-                d_amplitude += cosine * onto_re + sine * onto_im
-            d_angle = cosine.mul_(onto_im).sub_(sine.mul_(onto_re)).mul_(amplitude)
+            if d_amplitude is not None:
+                d_amplitude.addcmul_(cosine, onto_re).addcmul_(sine, onto_im)
+            d_angle = cosine.mul_(onto_im).sub_(sine.mul_(onto_re))
             for d_phase, own in zip(d_phases, factor, strict=True):
-                d_phase.add_(d_angle * own)
-        return d_phases, None, d_amplitude, None
+                d_phase.addcmul_(d_angle, own)
+        return d_phases.mul_(amplitude), None, d_amplitude, None
 
 
 def _sines(factor: Tensor, phases: Tensor) -> Pair:
@@ -575,7 +573,7 @@ def _sines(factor: Tensor, phases: Tensor) -> Pair:
     angle = factor[0] * phases[0]
     for own, phase in zip(factor[1:], phases[1:], strict=True):
         angle.addcmul_(own, phase)
-    return angle.cos(), angle.sin()
+    return sines(angle)
 
 
 def to_pixels(intensity: Tensor, query: Query, *, per_pixel: float, reach: int) -> Tensor:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -448,7 +449,7 @@ def _pupil(coefficients: Tensor, laid: tuple[Tensor, Tensor | None], fields: Pai
     """Real and imaginary part of amplitude * field * exp(i phase) for the distances of one group."""
     maps, amplitude = laid
     phase = (coefficients @ maps.flatten(1)).view(coefficients.shape[0], *maps.shape[1:])
-    re, im = phase.cos(), phase.sin()  # torch.polar costs five times as much
+    re, im = sines(phase)
     if amplitude is not None:
         re *= amplitude
         im *= amplitude
@@ -456,6 +457,17 @@ def _pupil(coefficients: Tensor, laid: tuple[Tensor, Tensor | None], fields: Pai
         return re, im
     f_re, f_im = fields[0][group], fields[1][group]
     return re * f_re - im * f_im, re * f_im + im * f_re
+
+
+def sines(angle: Tensor) -> Pair:
+    """Cosine and sine, for the inside of an `autograd.Function`: without a graph.
+
+    Measured: numpy takes 0.4 of torch's time, but one thread; torch.polar costs five times as much.
+    """
+    if angle.device.type != "cpu" or torch.get_num_threads() > 2:
+        return angle.cos(), angle.sin()
+    values = angle.numpy()
+    return torch.from_numpy(np.cos(values)), torch.from_numpy(np.sin(values))
 
 
 def _kernel_gradient(

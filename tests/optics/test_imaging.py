@@ -810,14 +810,15 @@ def test_provides_its_optics() -> None:
 
 @pytest.mark.parametrize("border", ["reflect", "replicate", "periodic", "zero"])
 @pytest.mark.parametrize("factors", [None, 5])
-def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: int | None) -> None:
+@pytest.mark.parametrize("room", [8, 1000], ids=["spectra again", "spectra held"])
+def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: int | None, room: int) -> None:
     """To the planes, the PSFs, the scene's spectra and the filter: the hand-written adjoint against differences."""
     from kcam.optics.convolution import Contraction, Convolution
     from kcam.optics.transforms import fast_length
 
     picture, window = (5, 6), (4, 9)  # an even window, and one wider than the picture
     size = tuple(fast_length(n + m) for n, m in zip(picture, window, strict=True))
-    plan = Convolution(picture=picture, window=window, border=border, size=size, bands=2)
+    plan = Convolution(picture=picture, window=window, border=border, size=size, room=room)
     planes = random(2, 3 if factors is None else factors, *picture).requires_grad_()
     psfs = random(3, *window, seed=7).requires_grad_()
     weights = random(2, 3, seed=8).requires_grad_()
@@ -828,6 +829,35 @@ def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: i
 
     inputs = (planes, psfs, weights) if spectra is None else (planes, psfs, weights, spectra)
     assert torch.autograd.gradcheck(contract, inputs)
+
+
+@pytest.mark.parametrize("max_memory", [1e9, 1.0], ids=["held", "again"])
+def test_spectra_are_computed_again_where_they_do_not_fit(monkeypatch, max_memory: float) -> None:
+    from kcam.optics.convolution import Contraction, Convolution
+
+    calls = []
+    whole = Convolution.transform
+    monkeypatch.setattr(Convolution, "transform", lambda self, planes: calls.append(1) or whole(self, planes))
+    plan = Convolution.of((12, 10), (5, 4), border="reflect", itemsize=4, max_memory=max_memory)
+    psfs = torch.rand(5, 5, 4, requires_grad=True)
+    Contraction.apply(torch.rand(2, 5, 12, 10), psfs, None, torch.rand(3, 5), None, plan).sum().backward()
+    assert len(calls) == (10 if max_memory == 1e9 else 20)
+
+
+@pytest.mark.parametrize("border", ["reflect", "replicate", "periodic", "zero"])
+def test_transforms_are_those_of_the_extended_picture(border: str) -> None:
+    """The rows of the border are not transformed again, nor planes all at once: it is one FFT of the whole still."""
+    from kcam.optics.convolution import Convolution, extend
+
+    plan = Convolution.of((12, 10), (5, 8), border=border, itemsize=8, max_memory=1e9)
+    planes = random(2, 3, 12, 10)
+    expected = torch.fft.rfft2(extend(planes, (5, 8), border, zeros_after=False), s=plan.size)
+    spectrum = plan.transform(planes)
+    assert torch.allclose(spectrum, expected, atol=1e-12)
+    assert torch.allclose(plan.transform(planes[0, 0]), spectrum[0, 0], atol=1e-12)
+    cropped = torch.fft.irfft2(spectrum, s=plan.size)[..., :12, :10]
+    assert torch.allclose(plan.back(spectrum), cropped, atol=1e-12)
+    assert torch.allclose(plan.back_adjoint(planes), torch.fft.rfft2(planes, s=plan.size), atol=1e-12)
 
 
 def test_a_batch_shares_the_transforms_of_its_psfs(monkeypatch: pytest.MonkeyPatch) -> None:

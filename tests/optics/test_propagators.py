@@ -369,3 +369,18 @@ def test_fft_refuses_points_that_its_bins_cannot_reach() -> None:
     with pytest.raises(ValueError, match=r"cannot place its bins on points 2e-05 m apart .*method='matrix'"):
         lens.psf([550e-9], method="fft", **arguments)
     assert torch.isfinite(lens.psf([550e-9], method="matrix", **arguments)).all()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1.2e-7), (torch.float64, 2.5e-16)])
+def test_sines(monkeypatch: pytest.MonkeyPatch, threads: int, dtype: torch.dtype, error: float) -> None:
+    """To the last bit or so over the phases of a pupil, by numpy on few threads and by torch on many."""
+    from kcam.optics.transforms import sines
+
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    angle = torch.linspace(-3000, 3000, 30001, dtype=torch.float64).to(dtype)
+    cosine, sine = sines(angle)
+    for found, exact in ((cosine, np.cos), (sine, np.sin)):
+        assert found.dtype == dtype
+        truth = exact(angle.numpy().astype(np.longdouble))
+        assert np.abs(found.numpy() - truth).max() <= error
