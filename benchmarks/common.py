@@ -6,19 +6,21 @@ ratio is taken within the round. What is published is the median of the rounds' 
 
 from __future__ import annotations
 
+import io
 import statistics
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from kcam import measure
+from kcam import measure, plots
 from kcam.measure import write_json as write_json
 
 ROOT = Path(__file__).parents[1]
@@ -162,3 +164,14 @@ def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
 
 def _errors(error: dict[str, float], *kinds: str) -> str:
     return " / ".join(f"{error[kind]:.1e}" for kind in kinds if kind in error)
+
+
+def save_jpeg(figure: Any, path: Path, *, resolutions: Sequence[float] = (200,), largest: int = 400_000) -> None:
+    """A figure as a JPEG of at most `largest` bytes, at the first of `resolutions` [dots per inch] that allows it."""
+    for resolution in resolutions:
+        picture = Image.open(io.BytesIO(plots.figure_bytes(figure, resolution=resolution))).convert("RGB")
+        for quality in (92, 88, 84, 80, 75, 70):
+            picture.save(path, quality=quality, subsampling=0, optimize=True)  # colours at full resolution
+            if path.stat().st_size < largest:
+                return
+    raise ValueError(f"{path.name} has {path.stat().st_size} bytes at quality {quality}; expected < {largest}.")

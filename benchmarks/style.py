@@ -13,7 +13,6 @@ that two processes can share them.
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import time
 import warnings
@@ -23,11 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from PIL import Image
 from torch import Tensor, nn
 
 from benchmarks import style_measures as measures
-from benchmarks.common import ROOT, environment, write_json
+from benchmarks.common import ROOT, environment, save_jpeg, write_json
 from kcam import isp, optics, plots, sensor
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
@@ -42,6 +40,7 @@ CAMERA_STEPS = 150
 THESIS_STEPS = 300
 PAINT_STEPS = 120
 SEED = 5  # of the shots
+BULKY: dict[str, Any] = {"resolutions": (110, 90, 75, 60), "largest": 600_000}  # strokes and noise
 
 
 class HardClip(nn.Module):
@@ -270,7 +269,7 @@ def collect(work: Path) -> None:
         ),
     }
     for name, figure in sheets.items():
-        save_jpeg(figure, ROOT / "docs" / f"{name}.jpg")
+        save_jpeg(figure, ROOT / "docs" / f"{name}.jpg", **BULKY)
     print(RESULT, *sheets)
 
 
@@ -288,18 +287,7 @@ def paint_pictures() -> None:
         titles=["Style", "Texture, from white noise", "Painting, from the photo"],
         labels=list(STYLES),
     )
-    save_jpeg(sheet, ROOT / "docs" / "painted.jpg")
-
-
-def save_jpeg(figure: Any, path: Path, *, largest: int = 600_000) -> None:
-    """As docs/generate.py does, which cannot be imported before it has read the results."""
-    for resolution in (110, 90, 75, 60):  # strokes and noise are bulky
-        content = plots.figure_bytes(figure, resolution=resolution)
-        picture = Image.open(io.BytesIO(content)).convert("RGB")
-        for quality in (88, 80, 72):
-            picture.save(path, quality=quality, optimize=True)
-            if path.stat().st_size < largest:
-                return
+    save_jpeg(sheet, ROOT / "docs" / "painted.jpg", **BULKY)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ import torch  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import kcam.augmentation as KC  # noqa: E402
+from benchmarks.common import save_jpeg  # noqa: E402
 from kcam import Camera, Plan, Scene, demo, optics, plots  # noqa: E402
 from kcam.data import FORMATS  # noqa: E402
 from kcam.optics.propagation import choose  # noqa: E402
@@ -785,7 +786,7 @@ def gallery(path: Path) -> None:
     sys.path.insert(0, str(ROOT / "examples"))
     import psf_gallery
 
-    save_jpeg(psf_gallery.figure(psf_gallery.gallery()), path, resolution=200)
+    save_jpeg(psf_gallery.figure(psf_gallery.gallery()), path)
 
 
 def augmentation_gallery(path: Path) -> None:
@@ -793,18 +794,7 @@ def augmentation_gallery(path: Path) -> None:
     sys.path.insert(0, str(ROOT / "examples"))
     import augmentation_gallery as example
 
-    save_jpeg(example.figure(example.gallery(), example.original()[0]), path, resolution=165)  # noise is bulky
-
-
-def save_jpeg(figure: Any, path: Path, *, resolution: float = 200, largest: int = 400_000) -> None:
-    """A figure as a JPEG of at most `largest` bytes, with its colours at full resolution."""
-    content = plots.figure_bytes(figure, resolution=resolution)
-    picture = Image.open(io.BytesIO(content)).convert("RGB")
-    for quality in (92, 88, 84, 80, 75, 70):
-        picture.save(path, quality=quality, subsampling=0, optimize=True)
-        if path.stat().st_size < largest:
-            return
-    raise ValueError(f"{path.name} has {path.stat().st_size} bytes at quality {quality}; expected < {largest}.")
+    save_jpeg(example.figure(example.gallery(), example.original()[0]), path, resolutions=(165,))  # noise is bulky
 
 
 PLOTS = {"peers.png": RESULTS / "peers.json"} | {f"tradeoff-{name}.png": path for name, path in SWEEPS.items()}

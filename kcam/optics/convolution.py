@@ -395,7 +395,7 @@ class Contraction(torch.autograd.Function):
     def forward(ctx, planes, psfs, spectra, weights, kept, convolution):
         channels = weights.shape[0]
         factors = None if spectra is None else convolution.transform(planes)
-        held: list[Tensor] = []
+        held = []
         of_use = spectra is None and (ctx.needs_input_grad[1] or ctx.needs_input_grad[3])
         hold = of_use and 4 * planes[:, :, 0, 0].numel() <= convolution.room
         totals = planes.new_zeros(planes.shape[0], channels, 2 * convolution.points)

@@ -5,8 +5,10 @@ from kcam.style.losses import StyleLoss
 from kcam.style.painting import paint
 from kcam.style.pictures import STYLES, painting
 from kcam.style.presets import PRESETS, Preset, style_camera
+from kcam.style.run import StyleWarning, TrainingError
 from kcam.style.scenes import BuiltinScenes, PatchScenes, Source
-from kcam.style.training import Progress, Settings, StyleWarning, Trained, TrainingError, fit
+from kcam.style.settings import Settings
+from kcam.style.training import Progress, Trained, fit
 from kcam.style.vgg import VGG16Features
 
 __all__ = [

@@ -14,7 +14,7 @@ from kcam import isp, optics, sensor
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.style.losses import StyleLoss
-from kcam.style.training import Settings
+from kcam.style.settings import Settings
 from kcam.units import mm, nm, um
 
 DOE_SIDE = 64

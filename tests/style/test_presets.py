@@ -15,7 +15,7 @@ from kcam.context import Context
 from kcam.style import PRESETS, BuiltinScenes, painting, style_camera
 from kcam.style.losses import luminance
 from kcam.style.presets import smooth_phase
-from kcam.style.training import trained_parameters
+from kcam.style.settings import trained_parameters
 from kcam.units import mm, um
 
 SCENES = ("coffee", "chelsea", "motorcycle")

@@ -20,7 +20,8 @@ from kcam import isp, optics, sensor
 from kcam.camera import Camera
 from kcam.scene import Scene
 from kcam.style import Settings, StyleLoss, StyleWarning, TrainingError, fit
-from kcam.style.training import photograph, trained_parameters
+from kcam.style.settings import trained_parameters
+from kcam.style.step import photograph
 
 PROGRAM = Path(__file__).with_name("training_process.py")
 
@@ -178,7 +179,7 @@ class Wild(StyleLoss):
 
 
 def test_a_diverging_loss_goes_back(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.training.MEMORY", 6)
+    monkeypatch.setattr("kcam.style.run.MEMORY", 6)
     loss = Wild(tiny.painting("woodcut", size=128)[:, : tiny.SIZE, : tiny.SIZE])
     with pytest.warns(StyleWarning, match=r"step 8: the loss is .* times its recent median"):
         trained = train(None, loss=loss, steps=10, every=5, rates={"demosaic": 1e-4})
@@ -186,7 +187,7 @@ def test_a_diverging_loss_goes_back(monkeypatch) -> None:
 
 
 def test_the_content_weight_follows_its_aim(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.training.AIMED_FROM", 2)
+    monkeypatch.setattr("kcam.style.run.AIMED_FROM", 2)
 
     def content(aim: float | None, **how) -> Tensor:
         return train(how.pop("folder", None), content_aim=aim, **how).history[:, 3]
@@ -259,7 +260,7 @@ def test_a_plan_is_frozen_and_kept(tmp_path: Path) -> None:
 
 
 def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.training.LOOK", 2)
+    monkeypatch.setattr("kcam.style.run.LOOK", 2)
     inverted = nn.Parameter(-torch.eye(3)[:, :, None, None].repeat(1, 1, 3, 3) / 9)
     still = tiny.settings(steps=2, rates={"demosaic": 1e-6})
     stages = list(tiny.camera(stage=False))
@@ -277,7 +278,7 @@ def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
 
 
 def test_a_stage_that_paints_all_white_is_told(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.training.LOOK", 2)
+    monkeypatch.setattr("kcam.style.run.LOOK", 2)
     camera = tiny.camera()
     with torch.no_grad():
         camera[-1].leave.bias.fill_(100.0)
@@ -287,14 +288,14 @@ def test_a_stage_that_paints_all_white_is_told(monkeypatch) -> None:
 
 def test_an_aim_is_for_the_correlation_alone(monkeypatch) -> None:
     """A loss by features has another unit for each network: its weight stays."""
-    monkeypatch.setattr("kcam.style.training.AIMED_FROM", 0)
+    monkeypatch.setattr("kcam.style.run.AIMED_FROM", 0)
     by_features = tiny.loss(content_by="features", content_layer="scale 1")
     aimed, plain = (train(None, loss=by_features, content_aim=aim, steps=3).history for aim in (0.01, None))
     assert torch.equal(aimed, plain)
 
 
 def test_a_channel_that_goes_blind_is_told(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.training.LOOK", 2)
+    monkeypatch.setattr("kcam.style.run.LOOK", 2)
     camera = tiny.camera(stage=False)
 
     class Darkening(tiny.BuiltinScenes):
@@ -401,7 +402,7 @@ def test_two_processes_give_the_curve_of_one(tmp_path: Path) -> None:
 
 
 def test_a_batch_that_the_processes_cannot_share(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.training._place", lambda: (0, 3))
+    monkeypatch.setattr("kcam.style.run.place", lambda: (0, 3))
     with pytest.raises(ValueError, match=r"a batch of 2 cannot be shared by 3 processes"):
         fit(tiny.camera(), tiny.loss(), source=tiny.source(), settings=tiny.settings())
 
