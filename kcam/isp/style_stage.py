@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -18,6 +19,8 @@ from kcam.ste import clip_ste
 SEEN_AT_ONCE = 2**20
 """Pixels; a larger picture is painted in tiles."""
 TILE = 512
+LEAST_VARIANCE = 1e-5
+"""Added to what a normalisation divides by."""
 LENGTH, WIDTH = 7.0, 1.5
 """Standard deviations of drawn-out noise along its direction and across [pixels]."""
 LONGEST = 14
@@ -61,12 +64,12 @@ class _Norm(nn.Module):
     def forward(self, x: Tensor, given: Iterator[tuple[Tensor, Tensor]] | None, seen: list | None) -> Tensor:
         if given is not None:
             mean, variance = next(given)
-        else:
-            over = (2, 3) if seen is None else (0, 2, 3)
-            variance, mean = torch.var_mean(x, over, correction=0, keepdim=True)
-        if seen is not None:
+        elif seen is not None:
+            variance, mean = torch.var_mean(x, (0, 2, 3), correction=0, keepdim=True)
             seen.append((mean, variance))
-        gain = self.weight[:, None, None] * torch.rsqrt(variance + 1e-5)
+        else:  # a tenth of the time of its formula; unlike torch.nn's, it also takes a single pixel
+            return torch.group_norm(x, x.shape[1], self.weight, self.bias, LEAST_VARIANCE)
+        gain = self.weight[:, None, None] * torch.rsqrt(variance + LEAST_VARIANCE)
         return x * gain + (self.bias[:, None, None] - mean * gain)
 
 
@@ -261,8 +264,7 @@ def _flowing(draw: Callable[[int, int, int], Tensor], planes: int, height: int, 
     strips = []
     for top in range(0, height, TILE):  # of 12 megapixels, all directions would take 0.4 GB a plane
         rows = min(TILE, height - top)
-        drawn = F.conv2d(white[..., top : top + rows + 2 * LONGEST, :].flatten(0, 1)[:, None], kernels)
-        drawn = drawn.unflatten(0, (-1, planes))
+        drawn = _drawn_out(white[..., top : top + rows + 2 * LONGEST, :], kernels)
         cells = vectors[..., top // CELL : -(-(top + rows) // CELL) + 4, :]
         flow = F.interpolate(cells, scale_factor=CELL, mode="bicubic", align_corners=False)
         flow = flow[..., 2 * CELL : 2 * CELL + rows, 2 * CELL : 2 * CELL + width].unflatten(0, (-1, flows))
@@ -278,14 +280,28 @@ def _flowing(draw: Callable[[int, int, int], Tensor], planes: int, height: int, 
     return torch.cat(strips, dim=2)
 
 
+def _drawn_out(white: Tensor, kernels: Tensor) -> Tensor:
+    """White noise (B,planes,h,w) convolved with each kernel where these lie inside: (B,planes,8,h-28,w-28).
+
+    By FFT, a third of the time of the sums; one at a time, so that each stays in the processor's cache.
+    """
+    height, width = white.shape[-2:]
+    size = (next_fast_len(height, real=True), next_fast_len(width, real=True))
+    inside = (..., slice(2 * LONGEST, height), slice(2 * LONGEST, width))
+    transfers = torch.fft.rfft2(kernels, s=size)
+    spectra = (torch.fft.rfft2(plane, s=size) for plane in white.flatten(0, 1))
+    drawn = [torch.fft.irfft2(spectrum * own, s=size)[inside] for spectrum in spectra for own in transfers]
+    return torch.stack(drawn).unflatten(0, (*white.shape[:2], DIRECTIONS))
+
+
 def stroke_kernels() -> Tensor:
-    """Gaussians of sigma 7 by 1.5 pixels along 8 directions, (8,1,29,29), that keep the variance of noise."""
+    """Gaussians of sigma 7 by 1.5 pixels along 8 directions, (8,29,29), that keep the variance of noise."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
     angle = torch.arange(DIRECTIONS, dtype=torch.float64)[:, None, None] * (math.pi / DIRECTIONS)
     along, across = x * torch.cos(angle) + y * torch.sin(angle), y * torch.cos(angle) - x * torch.sin(angle)
     kernels = torch.exp(-(along**2) / (2 * LENGTH**2) - across**2 / (2 * WIDTH**2))
-    return (kernels / kernels.square().sum((-2, -1), keepdim=True).sqrt())[:, None]
+    return kernels / kernels.square().sum((-2, -1), keepdim=True).sqrt()
 
 
 def _doubled(x: Tensor) -> Tensor:

@@ -137,6 +137,11 @@ class Query:
             return float(self.image_side_semi_aperture), float(self.sensor_distance)
 
     @functools.cached_property
+    def has_pixel_phase(self) -> bool:
+        """Whether the lens has; kept, because sampling rules ask for it at each wavelength."""
+        return self.lens.has_pixel_phase
+
+    @functools.cached_property
     def displacement(self) -> Tensor:
         """How far the smooth part of the pupil sends its rays on the sensor, max d |grad W|, (L,) float64 [m].
 
@@ -231,7 +236,7 @@ def samples_by_rule(query: Query, *, displacement: float, wavelength: float) -> 
     """Pupil samples by the rule of `sampling.pupil_samples`, however many."""
     geometry = _geometry(query, displacement=displacement, wavelength=wavelength)
     needed = sampling.pupil_samples(**geometry, kappa=query.kappa)
-    if query.lens.has_pixel_phase:  # few distinct grids: each needs weights of its own for the map
+    if query.has_pixel_phase:  # few distinct grids: each needs weights of its own for the map
         step = max(64, 2 ** (needed.bit_length() - 4))
         needed = step * math.ceil(needed / step)
     return needed

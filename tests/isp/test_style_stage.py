@@ -187,12 +187,20 @@ def test_drawn_out_noise_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_stroke_kernels_turn_with_their_number() -> None:
     kernels = stroke_kernels()
-    assert kernels.shape == (8, 1, 29, 29)
-    torch.testing.assert_close(kernels.square().sum((-2, -1)), torch.ones(8, 1, dtype=torch.float64))
-    torch.testing.assert_close(kernels[0, 0].T, kernels[4, 0])
-    torch.testing.assert_close(kernels[2, 0].flip(-1), kernels[6, 0])
-    overlaps = (kernels[:-1] * kernels[1:]).sum((1, 2, 3))
+    assert kernels.shape == (8, 29, 29)
+    torch.testing.assert_close(kernels.square().sum((-2, -1)), torch.ones(8, dtype=torch.float64))
+    torch.testing.assert_close(kernels[0].T, kernels[4])
+    torch.testing.assert_close(kernels[2].flip(-1), kernels[6])
+    overlaps = (kernels[:-1] * kernels[1:]).sum((1, 2))
     assert overlaps.max() < 1.02 * overlaps.min()  # one number serves all neighbours
+
+
+@pytest.mark.parametrize("size", [(40, 57), (29, 64)])
+def test_noise_is_drawn_out_by_the_convolution(size: tuple[int, int]) -> None:
+    kernels = stroke_kernels()
+    white = torch.randn(2, 3, *size, dtype=torch.float64, generator=seeded())
+    sums = torch.nn.functional.conv2d(white.flatten(0, 1)[:, None], kernels[:, None]).unflatten(0, (2, 3))
+    torch.testing.assert_close(style_stage._drawn_out(white, kernels), sums)
 
 
 def test_whole_numbers_are_no_picture() -> None:
@@ -504,3 +512,18 @@ def test_a_float64_scene_gives_a_float64_picture(scene: Scene) -> None:
 
 def test_it_stands_behind_the_tone_curve_and_says_what_it_is() -> None:
     assert "width=16, dilations=(1, 2, 4, 8), noise=(0, 2, 8), level=1" in repr(isp.StyleStage())
+
+
+def test_a_normalisation_with_given_statistics_is_that_with_its_own() -> None:
+    """Pictures in tiles and whole ones take two ways to one formula."""
+    norm = style_stage._Norm(3).double()
+    with torch.no_grad():
+        norm.weight.copy_(torch.tensor([0.5, 1.0, 2.0]))
+        norm.bias.copy_(torch.tensor([-1.0, 0.0, 1.0]))
+    x = torch.randn(1, 3, 6, 5, dtype=torch.float64, generator=seeded())
+    seen: list = []
+    pooled = norm(x, None, seen)
+    torch.testing.assert_close(norm(x, None, None), pooled)
+    torch.testing.assert_close(norm(x, iter(seen), None), pooled)
+    expected = (x - x.mean((2, 3), keepdim=True)) / (x.var((2, 3), correction=0, keepdim=True) + 1e-5).sqrt()
+    torch.testing.assert_close(pooled, expected * norm.weight[:, None, None] + norm.bias[:, None, None])

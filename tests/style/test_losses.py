@@ -119,6 +119,13 @@ def test_moments_are_numpys():
         assert np.abs(covariance[b].numpy() - np.cov(flat, bias=True)).max() < 1e-14
 
 
+def test_moments_have_the_gradient_of_their_formula():
+    """To the second order: who penalises gradients may."""
+    phi = noise(2, 3, 2, 4).requires_grad_()
+    assert torch.autograd.gradcheck(moments, phi)
+    assert torch.autograd.gradgradcheck(moments, phi)
+
+
 def test_moment_loss_by_its_equation():
     mean, covariance = noise(2, 3), noise(2, 3, 3)
     target_mean, target_covariance = noise(3, seed=1), noise(3, 3, seed=1)
