@@ -33,7 +33,7 @@ MOST_STAGES = 2**10
 DIVERGED = 10.0  # times the median of the last losses
 MEMORY = 50  # losses
 LOOK = 20  # steps between looks at the pictures
-AIMED_FROM = 50  # steps: before, there is more scene than style in any picture
+SETTLED = 50  # steps: before, pictures are neither the scene nor the style yet, and say nothing
 AIM_GAIN, AIM_MEMORY, AIM_RANGE = 0.02, 0.95, 2.0
 MOST_RETURNS = 3
 CLIPPED, NEGATIVE, DEAD = 0.1, 0.3, 0.05
@@ -131,7 +131,7 @@ class Run:
         self.history.append(values)
         self._aim()
         self.clock.mark("update")
-        if self.step % LOOK == 0:
+        if self.step % LOOK == 0 and self.step > SETTLED:
             self._look(picture.detach(), scene)
 
     def _aim(self) -> None:
@@ -142,7 +142,7 @@ class Run:
         now = self.terms()["content"] / (self.emphasis * self.loss.weights["content"])
         past = AIM_MEMORY if self.step > 1 else 0.0
         self.lost = past * self.lost + (1 - past) * now
-        if self.step > AIMED_FROM and self.lost > 0:
+        if self.step > SETTLED and self.lost > 0:
             moved = self.emphasis * (self.lost / aim) ** AIM_GAIN
             self.emphasis = min(AIM_RANGE, max(1 / AIM_RANGE, moved))
 

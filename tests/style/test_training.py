@@ -187,7 +187,7 @@ def test_a_diverging_loss_goes_back(monkeypatch) -> None:
 
 
 def test_the_content_weight_follows_its_aim(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.run.AIMED_FROM", 2)
+    monkeypatch.setattr("kcam.style.run.SETTLED", 2)
 
     def content(aim: float | None, **how) -> Tensor:
         return train(how.pop("folder", None), content_aim=aim, **how).history[:, 3]
@@ -261,6 +261,7 @@ def test_a_plan_is_frozen_and_kept(tmp_path: Path) -> None:
 
 def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
     monkeypatch.setattr("kcam.style.run.LOOK", 2)
+    monkeypatch.setattr("kcam.style.run.SETTLED", 0)
     inverted = nn.Parameter(-torch.eye(3)[:, :, None, None].repeat(1, 1, 3, 3) / 9)
     still = tiny.settings(steps=2, rates={"demosaic": 1e-6})
     stages = list(tiny.camera(stage=False))
@@ -279,6 +280,7 @@ def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
 
 def test_a_stage_that_paints_all_white_is_told(monkeypatch) -> None:
     monkeypatch.setattr("kcam.style.run.LOOK", 2)
+    monkeypatch.setattr("kcam.style.run.SETTLED", 0)
     camera = tiny.camera()
     with torch.no_grad():
         camera[-1].leave.bias.fill_(100.0)
@@ -288,7 +290,7 @@ def test_a_stage_that_paints_all_white_is_told(monkeypatch) -> None:
 
 def test_an_aim_is_for_the_correlation_alone(monkeypatch) -> None:
     """A loss by features has another unit for each network: its weight stays."""
-    monkeypatch.setattr("kcam.style.run.AIMED_FROM", 0)
+    monkeypatch.setattr("kcam.style.run.SETTLED", 0)
     by_features = tiny.loss(content_by="features", content_layer="scale 1")
     aimed, plain = (train(None, loss=by_features, content_aim=aim, steps=3).history for aim in (0.01, None))
     assert torch.equal(aimed, plain)
@@ -296,6 +298,7 @@ def test_an_aim_is_for_the_correlation_alone(monkeypatch) -> None:
 
 def test_a_channel_that_goes_blind_is_told(monkeypatch) -> None:
     monkeypatch.setattr("kcam.style.run.LOOK", 2)
+    monkeypatch.setattr("kcam.style.run.SETTLED", 0)
     camera = tiny.camera(stage=False)
 
     class Darkening(tiny.BuiltinScenes):
