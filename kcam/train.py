@@ -24,7 +24,7 @@ from kcam.scene import Scene, read_picture
 fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 
 SHOWN = ("astronaut", "coffee", "chelsea")
-SHOWN_SIZE = 192
+SHOWN_SIZE = 256
 FEATURES = ("steerable", "vgg16")
 
 

@@ -286,12 +286,13 @@ def _drawn_out(white: Tensor, kernels: Tensor) -> Tensor:
     By FFT, a third of the time of the sums; one at a time, so that each stays in the processor's cache.
     """
     height, width = white.shape[-2:]
+    exact = torch.promote_types(white.dtype, torch.float32)  # there are no FFTs of 16 bits on a CPU
     size = (next_fast_len(height, real=True), next_fast_len(width, real=True))
     inside = (..., slice(2 * LONGEST, height), slice(2 * LONGEST, width))
-    transfers = torch.fft.rfft2(kernels, s=size)
-    spectra = (torch.fft.rfft2(plane, s=size) for plane in white.flatten(0, 1))
+    transfers = torch.fft.rfft2(kernels.to(exact), s=size)
+    spectra = (torch.fft.rfft2(plane, s=size) for plane in white.to(exact).flatten(0, 1))
     drawn = [torch.fft.irfft2(spectrum * own, s=size)[inside] for spectrum in spectra for own in transfers]
-    return torch.stack(drawn).unflatten(0, (*white.shape[:2], DIRECTIONS))
+    return torch.stack(drawn).unflatten(0, (*white.shape[:2], DIRECTIONS)).to(white)
 
 
 def stroke_kernels() -> Tensor:

@@ -64,12 +64,17 @@ def moments(features: Tensor) -> tuple[Tensor, Tensor]:
 class _Moments(torch.autograd.Function):
     """Mean and covariance of (B,C,N) over N, whose gradient goes through memory once instead of six times."""
 
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx, flat):
+    def forward(flat):
         mean = flat.mean(2)
         centred = flat - mean[:, :, None]
-        ctx.save_for_backward(flat, mean)
         return mean, centred @ centred.mT / flat.shape[2]
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(inputs[0], output[0])
 
     @staticmethod
     def backward(ctx, d_mean, d_covariance):

@@ -527,3 +527,11 @@ def test_a_normalisation_with_given_statistics_is_that_with_its_own() -> None:
     torch.testing.assert_close(norm(x, iter(seen), None), pooled)
     expected = (x - x.mean((2, 3), keepdim=True)) / (x.var((2, 3), correction=0, keepdim=True) + 1e-5).sqrt()
     torch.testing.assert_close(pooled, expected * norm.weight[:, None, None] + norm.bias[:, None, None])
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_weights_of_16_bits(dtype: torch.dtype) -> None:
+    picture = random_picture(1, 3, 24, 32)
+    with torch.no_grad():
+        painted = painting_stage(**SMALL).to(dtype)(picture, Context(generator=seeded()))
+    assert painted.isfinite().all()

@@ -810,15 +810,15 @@ def test_provides_its_optics() -> None:
 
 @pytest.mark.parametrize("border", ["reflect", "replicate", "periodic", "zero"])
 @pytest.mark.parametrize("factors", [None, 5])
-@pytest.mark.parametrize("room", [8, 1000], ids=["spectra again", "spectra held"])
-def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: int | None, room: int) -> None:
+@pytest.mark.parametrize("held", [0, 1000], ids=["spectra again", "spectra held"])
+def test_the_contraction_has_the_gradient_of_its_formula(border: str, factors: int | None, held: int) -> None:
     """To the planes, the PSFs, the scene's spectra and the filter: the hand-written adjoint against differences."""
     from kcam.optics.convolution import Contraction, Convolution
     from kcam.optics.transforms import fast_length
 
     picture, window = (5, 6), (4, 9)  # an even window, and one wider than the picture
     size = tuple(fast_length(n + m) for n, m in zip(picture, window, strict=True))
-    plan = Convolution(picture=picture, window=window, border=border, size=size, room=room)
+    plan = Convolution(picture=picture, window=window, border=border, size=size, bands=2, held=held)
     planes = random(2, 3 if factors is None else factors, *picture).requires_grad_()
     psfs = random(3, *window, seed=7).requires_grad_()
     weights = random(2, 3, seed=8).requires_grad_()
@@ -844,11 +844,49 @@ def test_spectra_are_computed_again_where_they_do_not_fit(monkeypatch, max_memor
     assert len(calls) == (10 if max_memory == 1e9 else 20)
 
 
+@pytest.mark.parametrize(("tile", "layers", "most"), [(None, 1, 28), (None, 8, 0), (64, 1, 0)])
+def test_what_is_held_stays_within_a_quarter_of_the_memory(tile: int | None, layers: int, most: int) -> None:
+    """Of all layers together; tiles hold nothing."""
+    from kcam.optics.convolution import Renderer
+
+    bands, saved = 28, []
+
+    def pack(tensor: Tensor) -> Tensor:
+        if tensor.is_complex():
+            saved.append(tensor)
+        return tensor
+
+    renderer = Renderer(
+        torch.rand(layers, bands, 9, 9, requires_grad=True),
+        spectra=None,
+        weights=torch.rand(bands, bands),  # so many channels that the bands' way is the cheapest for one layer
+        picture=(96, 96),
+        tile=tile,
+        max_memory=4 * 4 * 32 * 112**2,
+    )
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        total = sum(renderer.blur(torch.rand(1, bands, 96, 96), layer=z).sum() for z in range(layers))
+    assert len(saved) == most
+    total.backward()
+
+
+def test_a_window_wider_than_a_picture_in_the_dark_trains() -> None:
+    """Zeros around a picture of 16 pixels, and a PSF of 41: it has a gradient in all of its pixels."""
+    from kcam.optics.convolution import Contraction, Convolution
+
+    plan = Convolution.of((7, 6), (19, 18), border="zero", itemsize=8, max_memory=1e9)
+    psfs, planes, weights = random(2, 19, 18).requires_grad_(), random(1, 2, 7, 6), random(1, 2)
+    assert torch.autograd.gradcheck(lambda psfs: Contraction.apply(planes, psfs, None, weights, None, plan), psfs)
+
+
+@pytest.mark.parametrize("pixels_in_cache", [1, 2**16])
 @pytest.mark.parametrize("border", ["reflect", "replicate", "periodic", "zero"])
-def test_transforms_are_those_of_the_extended_picture(border: str) -> None:
+def test_transforms_are_those_of_the_extended_picture(monkeypatch, border: str, pixels_in_cache: int) -> None:
     """The rows of the border are not transformed again, nor planes all at once: it is one FFT of the whole still."""
+    from kcam.optics import convolution
     from kcam.optics.convolution import Convolution, extend
 
+    monkeypatch.setattr(convolution, "_PIXELS_IN_CACHE", pixels_in_cache)
     plan = Convolution.of((12, 10), (5, 8), border=border, itemsize=8, max_memory=1e9)
     planes = random(2, 3, 12, 10)
     expected = torch.fft.rfft2(extend(planes, (5, 8), border, zeros_after=False), s=plan.size)

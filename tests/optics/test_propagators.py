@@ -374,7 +374,7 @@ def test_fft_refuses_points_that_its_bins_cannot_reach() -> None:
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1.2e-7), (torch.float64, 2.5e-16)])
 def test_sines(monkeypatch: pytest.MonkeyPatch, threads: int, dtype: torch.dtype, error: float) -> None:
-    """To the last bit or so over the phases of a pupil, by numpy on few threads and by torch on many."""
+    """To the last bit or so over the phases of a pupil, by numpy on few threads and by torch on many; inf is NaN."""
     from kcam.optics.transforms import sines
 
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
@@ -384,3 +384,4 @@ def test_sines(monkeypatch: pytest.MonkeyPatch, threads: int, dtype: torch.dtype
         assert found.dtype == dtype
         truth = exact(angle.numpy().astype(np.longdouble))
         assert np.abs(found.numpy() - truth).max() <= error
+    assert all(part.isnan().all() for part in sines(torch.tensor([math.inf, -math.inf], dtype=dtype)))

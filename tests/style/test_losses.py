@@ -126,6 +126,19 @@ def test_moments_have_the_gradient_of_their_formula():
     assert torch.autograd.gradgradcheck(moments, phi)
 
 
+def test_moments_under_torch_func():
+    phi = noise(4, 2, 3, 2, 4)
+
+    def total(phi: Tensor) -> Tensor:
+        mean, covariance = moments(phi)
+        return mean.square().sum() + covariance.square().sum()
+
+    each = torch.func.vmap(torch.func.grad(total))(phi)
+    for own, one in zip(each, phi, strict=True):
+        one = one.clone().requires_grad_()
+        torch.testing.assert_close(own, torch.autograd.grad(total(one), one)[0])
+
+
 def test_moment_loss_by_its_equation():
     mean, covariance = noise(2, 3), noise(2, 3, 3)
     target_mean, target_covariance = noise(3, seed=1), noise(3, 3, seed=1)
