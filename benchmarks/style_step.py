@@ -55,6 +55,8 @@ FASTER, SAME_TO = 6.0, 1e-4
 TOLERANCES = (0.004, 0.01, 0.03)
 """Of the plans that are raced beside the reference: fewer PSFs, the spectra's subspace."""
 DOUBLE_PIXELS = "textbook, 2 x 2 a pixel, complex128"
+DOUBLE_POINTS = "textbook, points, complex128"
+DOUBLES = (DOUBLE_POINTS, DOUBLE_PIXELS)
 SPARED_PIXELS = "textbook, 2 x 2 a pixel, checkpointed"
 Rows = list[dict[str, Any]]
 Picture = tuple[Tensor, tuple[Tensor, Tensor]]
@@ -312,7 +314,7 @@ class Bench:
         unpadded, twice = ({"padded": times * self.sizes.pupil} for times in (1, 2))
         return {
             "textbook, points": single,
-            "textbook, points, complex128": {},
+            DOUBLE_POINTS: {},
             "textbook, unpadded": single | unpadded,
             "textbook, padded to twice": single | twice,
         }
@@ -381,7 +383,7 @@ class Bench:
             direction="forward + backward",
             contestants=[
                 contestant("textbook, points", lambda: points(self.scene), dtype="complex64"),
-                contestant("textbook, points, complex128", lambda: double(self.scene), dtype="complex128"),
+                contestant(DOUBLE_POINTS, lambda: double(self.scene), dtype="complex128"),
                 contestant(SPARED_PIXELS, lambda: pixels(self.scene), dtype="complex64", once=True),
                 contestant("kcam", lambda: kcam_picture(camera, self.scene), default=True),
                 *(
@@ -408,20 +410,26 @@ def projected(rows: Rows) -> list[dict[str, Any]]:
 
 
 def verdicts_of(rows: Rows) -> list[dict[str, Any]]:
-    """What issue 8 asks: the camera part at least 6 times faster, the same loss to 1e-4."""
+    """What issue 8 asks: the camera part at least 6 times faster, the same loss to 1e-4.
+
+    Faster than the fastest fair textbook, and than the one that computes in complex128, as it is written first.
+    """
     verdicts = []
-    keys = ("op", "direction", "who", "ratio", "error_ratio")
     for row in rows:
         if not row["default"]:
             continue
-        if "camera" in row["op"]:
-            met = row["ratio"] >= FASTER
-            target = f"thesis's step, camera part: >= {FASTER:g} times faster"
-        else:
-            met = row["error"]["loss"] <= SAME_TO
+        said = {key: row[key] for key in ("op", "direction", "who", "ratio", "error_ratio")}
+        if "camera" not in row["op"]:
             target = f"thesis's step: the loss of the unfused float64 path to {SAME_TO:g}"
-        verdicts.append({"target": target, "met": met} | {key: row[key] for key in keys})
-    return verdicts
+            verdicts.append({"target": target, "met": row["error"]["loss"] <= SAME_TO} | said)
+            continue
+        race = [other for other in rows if (other["op"], other["direction"]) == (row["op"], row["direction"])]
+        doubles = {other["dtype"]: other["ratio"] for other in race if other["who"] in DOUBLES}
+        for dtype, ratio in ({"complex64": 1.0} | doubles).items():
+            faster = row["ratio"] / ratio
+            target = f"thesis's step, camera part: >= {FASTER:g} times faster than the textbook in {dtype}"
+            verdicts.append({"target": target, "met": faster >= FASTER} | said | {"ratio": float(f"{faster:.4g}")})
+    return sorted(verdicts, key=lambda verdict: verdict["target"])
 
 
 def measure(sizes: Sizes, console: Console) -> dict[str, Any]:

@@ -312,15 +312,22 @@ def test_a_step_is_raced_in_parts_and_whole(tmp_path):
     assert content["targets"] == content["projected"] == []
 
 
-@pytest.mark.parametrize(("ratio", "loss", "met"), [(6.1, 1e-5, [True, True]), (5.9, 2e-4, [False, False])])
+@pytest.mark.parametrize(
+    ("ratio", "loss", "met"),
+    [(6.1, 1e-5, [True, True, True]), (5.9, 2e-4, [True, False, False]), (2.9, 1e-5, [False, False, True])],
+)
 def test_a_step_is_judged_as_issue_8_asks(ratio, loss, met):
+    """By time against fields of complex128, which take twice as long here, of complex64, and by the loss."""
     common = {"direction": "forward", "who": "kcam", "error_ratio": None, "default": True, "ratio": ratio}
-    rows = [
-        common | {"op": "preset thesis: camera, textbook by points", "error": {}},
-        common | {"op": "preset thesis: whole step", "error": {"loss": loss}},
-    ]
-    rows += [row | {"default": False, "who": "textbook"} for row in rows]
-    assert [verdict["met"] for verdict in style_step.verdicts_of(rows)] == met
+    camera = common | {"op": "preset thesis: camera, textbook by points", "error": {}, "dtype": "float32"}
+    step = common | {"op": "preset thesis: whole step", "error": {"loss": loss}, "dtype": "float32"}
+    double = {"default": False, "who": style_step.DOUBLE_POINTS, "dtype": "complex128", "ratio": 0.5}
+    elsewhere = double | {"direction": "forward + backward", "ratio": 0.01}
+    rows = [camera, step, camera | double, step | double, camera | elsewhere]
+    rows += [row | {"default": False, "who": "textbook"} for row in (camera, step)]
+    verdicts = style_step.verdicts_of(rows)
+    assert [verdict["met"] for verdict in verdicts] == met
+    assert [verdict["ratio"] for verdict in verdicts] == pytest.approx([2 * ratio, ratio, ratio])
 
 
 def test_fifty_epochs_of_kaist_are_projected_from_a_step():
