@@ -423,8 +423,8 @@ def verdicts_of(rows: Rows) -> list[dict[str, Any]]:
             target = f"thesis's step: the loss of the unfused float64 path to {SAME_TO:g}"
             verdicts.append({"target": target, "met": row["error"]["loss"] <= SAME_TO} | said)
             continue
-        race = [other for other in rows if (other["op"], other["direction"]) == (row["op"], row["direction"])]
-        doubles = {other["dtype"]: other["ratio"] for other in race if other["who"] in DOUBLES}
+        beside = [other for other in rows if (other["op"], other["direction"]) == (row["op"], row["direction"])]
+        doubles = {other["dtype"]: other["ratio"] for other in beside if other["who"] in DOUBLES}
         for dtype, ratio in ({"complex64": 1.0} | doubles).items():
             faster = row["ratio"] / ratio
             target = f"thesis's step, camera part: >= {FASTER:g} times faster than the textbook in {dtype}"

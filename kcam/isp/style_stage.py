@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 from kcam.ste import clip_ste
 
@@ -287,7 +287,7 @@ def _drawn_out(white: Tensor, kernels: Tensor) -> Tensor:
     """
     height, width = white.shape[-2:]
     exact = torch.promote_types(white.dtype, torch.float32)  # there are no FFTs of 16 bits on a CPU
-    size = (next_fast_len(height, real=True), next_fast_len(width, real=True))
+    size = (fast_length(height), fast_length(width))
     inside = (..., slice(2 * LONGEST, height), slice(2 * LONGEST, width))
     transfers = torch.fft.rfft2(kernels.to(exact), s=size)
     spectra = (torch.fft.rfft2(plane, s=size) for plane in white.to(exact).flatten(0, 1))

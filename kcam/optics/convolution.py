@@ -347,7 +347,7 @@ class Convolution:
     def _extend(self, planes: Tensor, window: int, *, dim: int) -> Tensor:
         if self.border == "given":
             return planes
-        return extend_along(planes, window, self.border, dim=dim, zeros_after=False)
+        return extend_along(planes, window, self.border, dim=dim)  # zeros beyond the size are cut off there
 
     def transfer(self, kernels: Tensor) -> Tensor:
         """Conjugate transfer functions of kernels (..., h, w)."""
@@ -541,22 +541,18 @@ def correlate(planes: Tensor, kernels: Tensor, *, groups: int = 1) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
 
 
-def extend(planes: Tensor, window: tuple[int, int], border: str, *, zeros_after: bool = True) -> Tensor:
-    """The picture with the border that the window reaches: window // 2 before, the rest after.
-
-    zeros_after: False leaves them out where the border is zero, for a transform that appends zeros itself.
-    """
+def extend(planes: Tensor, window: tuple[int, int], border: str) -> Tensor:
+    """The picture with the border that the window reaches: window // 2 before, the rest after."""
     for dim, m in zip((-2, -1), window, strict=True):
-        planes = extend_along(planes, m, border, dim=dim, zeros_after=zeros_after)
+        planes = extend_along(planes, m, border, dim=dim)
     return planes
 
 
-def extend_along(planes: Tensor, window: int, border: str, *, dim: int, zeros_after: bool = True) -> Tensor:
+def extend_along(planes: Tensor, window: int, border: str, *, dim: int) -> Tensor:
     """`extend` along one axis, dim -2 or -1."""
     n, before, after = planes.shape[dim], window // 2, (window - 1) // 2
     if border == "zero":
-        ends = (before, after if zeros_after else 0)
-        return torch.nn.functional.pad(planes, (0, 0, *ends) if dim == -2 else ends)
+        return torch.nn.functional.pad(planes, (0, 0, before, after) if dim == -2 else (before, after))
     index = torch.arange(-before, n + after, device=planes.device)
     return planes.index_select(dim, _border_index(index, n, border))
 

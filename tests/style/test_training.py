@@ -259,9 +259,15 @@ def test_a_plan_is_frozen_and_kept(tmp_path: Path) -> None:
     assert torch.equal(train(tmp_path, tolerance=0.02, resume=True).history, trained.history)
 
 
-def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
+@pytest.fixture
+def looking_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the pictures, after two steps already."""
     monkeypatch.setattr("kcam.style.run.LOOK", 2)
     monkeypatch.setattr("kcam.style.run.SETTLED", 0)
+
+
+@pytest.mark.usefixtures("looking_early")
+def test_warnings_of_negative_and_clipped() -> None:
     inverted = nn.Parameter(-torch.eye(3)[:, :, None, None].repeat(1, 1, 3, 3) / 9)
     still = tiny.settings(steps=2, rates={"demosaic": 1e-6})
     stages = list(tiny.camera(stage=False))
@@ -278,9 +284,8 @@ def test_warnings_of_negative_and_clipped(monkeypatch) -> None:
     assert any("they clip" in str(w.message) for w in caught)
 
 
-def test_a_stage_that_paints_all_white_is_told(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.run.LOOK", 2)
-    monkeypatch.setattr("kcam.style.run.SETTLED", 0)
+@pytest.mark.usefixtures("looking_early")
+def test_a_stage_that_paints_all_white_is_told() -> None:
     camera = tiny.camera()
     with torch.no_grad():
         camera[-1].leave.bias.fill_(100.0)
@@ -296,9 +301,8 @@ def test_an_aim_is_for_the_correlation_alone(monkeypatch) -> None:
     assert torch.equal(aimed, plain)
 
 
-def test_a_channel_that_goes_blind_is_told(monkeypatch) -> None:
-    monkeypatch.setattr("kcam.style.run.LOOK", 2)
-    monkeypatch.setattr("kcam.style.run.SETTLED", 0)
+@pytest.mark.usefixtures("looking_early")
+def test_a_channel_that_goes_blind_is_told() -> None:
     camera = tiny.camera(stage=False)
 
     class Darkening(tiny.BuiltinScenes):
