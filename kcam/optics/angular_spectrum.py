@@ -8,8 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from kcam.optics.psf import Query, residual_path, to_pixels
-from kcam.optics.pupil import Pupil, pixel_under, round_weights, unfold_quadrant
+from kcam.optics.psf import Query, residual_path
+from kcam.optics.pupil import Pupil, pixel_under, round_weights
+from kcam.optics.quadrants import split, unfold
 from kcam.optics.transforms import fast_length
 
 
@@ -94,7 +95,7 @@ def _spectrum_band(query: Query, index: int, *, count: int, pitch: float) -> Ten
     sensor = kernel @ spectrum @ kernel.T
     intensity = sensor.real.square() + sensor.imag.square()
     factor = query.pixel_pitch**2 / energy
-    return to_pixels(intensity, query, per_pixel=per_pixel, reach=reach) * factor[:, None, None].to(query.dtype)
+    return query.to_pixels(split(intensity), per_pixel=per_pixel) * factor[:, None, None].to(query.dtype)
 
 
 def _point_transmission(query: Query, pupil: Pupil, *, pitch: float, count: int) -> tuple[Tensor, Tensor]:
@@ -110,5 +111,5 @@ def _point_transmission(query: Query, pupil: Pupil, *, pitch: float, count: int)
     half = min(count // 2, math.ceil(a / pitch) + 8)
     quadrant = round_weights(aperture.discs(), 2 * half, spacing=pitch / a)
     margin = count // 2 - half
-    weights = nn.functional.pad(unfold_quadrant(quadrant).to(query.device), (margin, margin, margin, margin))
+    weights = nn.functional.pad(unfold(quadrant).to(query.device), (margin, margin, margin, margin))
     return weights, weights

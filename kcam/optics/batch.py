@@ -12,8 +12,10 @@ from torch import Tensor
 
 from kcam.optics import sampling
 from kcam.optics.elements import zernike_sum
+from kcam.optics.pixels import to_pixels
 from kcam.optics.polar import legendre
-from kcam.optics.pupil import Pupil, disc_weights, grid_nodes, grid_spacing, unfold_quadrant
+from kcam.optics.pupil import Pupil, disc_weights, grid_nodes, grid_spacing
+from kcam.optics.quadrants import unfold
 from kcam.optics.transforms import MatrixTransform, pupil_intensity
 from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 
@@ -136,7 +138,7 @@ def _aberrated(
     nodes = grid_nodes(count)
     like = torch.empty(0, dtype=dtype, device=device)
     wavenumbers = (2 * math.pi / grid).to(device)
-    weights = unfold_quadrant(disc_weights(count, spacing=grid_spacing(count))).to(device)
+    weights = unfold(disc_weights(count, spacing=grid_spacing(count))).to(device)
     scales = wavenumbers * (a / d)
     intensity = pupil_intensity(
         (wavenumbers[:, None, None] * opd).to(dtype),
@@ -152,8 +154,8 @@ def _aberrated(
     )
     area = grid_spacing(count) ** 2 / float(weights.sum())
     factor = area * (a * pixel_pitch / (grid.to(device) * d)) ** 2  # (L,)
-    rows, columns = (sampling.pixel_box(n, per_pixel=per_pixel, reach=reach).to(like) for n in shape)
-    return ((rows @ intensity @ columns.mT) * factor[:, None, None, None].to(dtype)).transpose(0, 1)
+    pixels = to_pixels(intensity, shape, per_pixel=per_pixel)
+    return (pixels * factor[:, None, None, None].to(dtype)).transpose(0, 1)
 
 
 def _zernike_maps(nodes: Tensor, terms: int) -> Tensor:

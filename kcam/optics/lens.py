@@ -15,7 +15,8 @@ from kcam.optics.elements import DOE, Aperture, Element, PlanoConvexLens, Scalar
 from kcam.optics.explain import Explanation, explain
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
-from kcam.optics.pupil import disc_weights, unfold_quadrant
+from kcam.optics.pupil import disc_weights
+from kcam.optics.quadrants import unfold
 from kcam.optics.sampling import MAX_PUPIL_SAMPLES
 from kcam.units import check_distances, check_pixel_pitch, check_positive, check_trained, wavelength_grid
 
@@ -100,6 +101,11 @@ class Lens(nn.Module):
     def symmetric(self) -> bool:
         """Whether every element is rotationally symmetric by its type."""
         return all(element.symmetric for element in self.elements)
+
+    @property
+    def even(self) -> bool:
+        """Whether no element's path tells x from -x and y from -y, by its type; maps of pixels may."""
+        return all(element.symmetric or type(element).terms is Element.terms for element in self.elements)
 
     @property
     def round(self) -> bool:
@@ -466,7 +472,7 @@ def _disc_sum(image: Tensor, radius: int) -> Tensor:
         return image.sum((-2, -1)) * 0
     half = radius + 8
     centre = image.shape[-1] // 2
-    weights = unfold_quadrant(disc_weights(2 * half, spacing=1.0, radius=float(radius))).to(image)
+    weights = unfold(disc_weights(2 * half, spacing=1.0, radius=float(radius))).to(image)
     # the weights' nodes lie half-way between the image's points: shift by half a sample in the frequency domain
     window = image[..., centre - half : centre + half, centre - half : centre + half]
     return (window * _half_shifted(weights)).sum((-2, -1))

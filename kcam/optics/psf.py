@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 
 from kcam.optics import sampling
+from kcam.optics.linear import LinearMap, apply_linear
+from kcam.optics.pixels import to_pixels
 from kcam.optics.pupil import (
     EDGE_MARGIN,
     MapWeights,
@@ -29,12 +31,11 @@ from kcam.optics.pupil import (
     from_image_side,
     grid_nodes,
     grid_spacing,
-    map_onto,
     map_weights,
     pupil_tau,
     square_coverage,
-    unfold_quadrant,
 )
+from kcam.optics.quadrants import split, unfold
 from kcam.optics.transforms import (
     ChirpZTransform,
     Curvature,
@@ -155,6 +156,10 @@ class Query:
         if pixels is None:
             raise TypeError(f"{type(self.lens.aperture).__name__} has neither discs() nor a pixel_map().")
         return pixels.values
+
+    def to_pixels(self, quadrants: Tensor, *, per_pixel: float) -> Tensor:
+        """The intensity on the pixels, (..., H, W); see `pixels.to_pixels`."""
+        return to_pixels(quadrants, self.shape, per_pixel=per_pixel, active=self.active, integrate=self.integrate)
 
     def pupil(self, x: Tensor, y: Tensor) -> Pupil:
         """The pupil at true normalised coordinates."""
@@ -310,13 +315,6 @@ def _grid_group(
         count, length, spacing = fft_grid_for(query, displacement=spread, wavelength=wavelength)
     nodes = grid_nodes(count, spacing=spacing)
 
-    cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
-    x, y = nodes[None, :].to(query.device), nodes[:, None].to(query.device)
-    pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
-    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
-    amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing, curved=curved)
-    field = None if cells is None else _pixel_field(query, cells, count=count, spacing=spacing, curved=curved)
-
     def straight(scale: float) -> Transform:
         if method == "fft":
             return FFTTransform(count, length, reach)
@@ -326,6 +324,16 @@ def _grid_group(
     kernels = [straight(float(scale)) for scale in scales.detach()]
     if curved:
         kernels = _curve(query, kernels, scales, nodes, step=step, reach=reach, like=like)
+
+    cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
+    field = None
+    if cells is not None:
+        field = _pixel_field(query, cells, kernels[0], count=count, spacing=spacing, curved=curved)
+    along = (nodes[count // 2 :] if query.lens.even else nodes).to(query.device)
+    x, y = along[None, :], along[:, None]
+    pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
+    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
+    amplitude, energy = _amplitude(query, pupil, cells, count=count, spacing=spacing, curved=curved)
     intensity = pupil_intensity(
         (wavenumbers[:, None, None] * coefficients).to(query.dtype),
         maps=maps.to(query.dtype),
@@ -340,7 +348,7 @@ def _grid_group(
     # |sum w P|^2 -> energy per pixel: (a^2 h^2)^2 p^2 / (lambda d)^2 / E
     area = semi_aperture**2 * spacing**2
     factor = area * query.pixel_pitch**2 / (wavelengths * query.sensor_distance)[:, None] ** 2 / energy
-    return to_pixels(intensity, query, per_pixel=per_pixel, reach=reach) * factor[..., None, None].to(query.dtype)
+    return query.to_pixels(intensity, per_pixel=per_pixel) * factor[..., None, None].to(query.dtype)
 
 
 def _curve(
@@ -386,10 +394,12 @@ def fft_grid(scale_step: float, *, shortest: int) -> tuple[int, int, float]:
 def _amplitude(
     query: Query, pupil: Pupil, cells: _Cells | None, *, count: int, spacing: float, curved: bool
 ) -> tuple[Tensor, Tensor]:
-    """Quadrature weights times obliquity and source amplitude, (1 or Z, N, N), and the energy that passes (1 or Z,).
+    """Quadrature weights times obliquity and source amplitude, (1 or Z, ...), and the energy that passes (1 or Z,).
 
     Without pixel maps the weights hold the aperture; with them `_pixel_field` does, for the rim cuts the maps' pixels.
+    Both on the pupil's points: all of the grid, or those with x, y > 0.
     """
+    quadrant = query.lens.even
     if cells is None:
         weights = torch.zeros(count // 2, count // 2, dtype=torch.float64)
         for radius, weight in query.lens.aperture.discs():
@@ -399,13 +409,16 @@ def _amplitude(
                 return disc_weights(count, spacing=spacing, radius=image_side)
 
             weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
-        transmission = power = unfold_quadrant(weights).to(query.device)
+        weights = weights.to(query.device)
+        transmission, power = (weights, 4 * weights) if quadrant else (unfold(weights),) * 2
     else:
 
         def passed(tau: float) -> Tensor:
-            return map_onto(cells.power, _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved))
+            onto = _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved)
+            return apply_linear(cells.power, onto)
 
         power = _following(query.tau, passed, spacing=spacing).to(torch.float64)
+        power = split(power).sum(-3) if quadrant else power
         transmission = torch.ones_like(power)
     amplitude, energy = transmission[None], power[None]
     if not query.paraxial:
@@ -508,20 +521,19 @@ def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: flo
     return value + ((tau - tau.detach()) * slope).to(value)
 
 
-def _pixel_field(query: Query, cells: _Cells, *, count: int, spacing: float, curved: bool) -> Pair:
-    """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (L, N, N)."""
+def _pixel_field(query: Query, cells: _Cells, layout: Transform, *, count: int, spacing: float, curved: bool) -> Tensor:
+    """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (2, L, ...) in a transform's
+    layout.
+    """
 
     def both(tau: float) -> Tensor:
         onto = _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved)
-        return _PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto)
+        return _PixelField.apply(cells.phases, cells.factors, cells.amplitude, _LaidOut(onto, layout))
 
-    re, im = _following(query.tau, both, spacing=spacing)
-    return re, im
+    return _following(query.tau, both, spacing=spacing)
 
 
-def _onto_grid(
-    query: Query, cells: _Cells, tau: float, *, count: int, spacing: float, curved: bool
-) -> MapWeights | _Warped:
+def _onto_grid(query: Query, cells: _Cells, tau: float, *, count: int, spacing: float, curved: bool) -> LinearMap:
     """The way from the cells to the pupil grid: that of the true plane, or on to the image-side plane."""
     if curved or query.paraxial:
         return cells.weights
@@ -544,16 +556,30 @@ class _Warped:
         return self.weights.adjoint(self.warp.adjoint(grid))
 
 
+@dataclass(frozen=True)
+class _LaidOut:
+    """Cells onto the pupil grid, in the layout of a transform."""
+
+    onto: LinearMap
+    layout: Transform
+
+    def forward(self, field: Tensor) -> Tensor:
+        return self.layout.arrange(self.onto.forward(field))
+
+    def adjoint(self, grid: Tensor) -> Tensor:
+        return self.onto.adjoint(self.layout.disarrange(grid))
+
+
 class _PixelField(torch.autograd.Function):
-    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength, real and imaginary part (2, L, N, N);
+    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength, real and imaginary part (2, L, ...);
     no sines are kept for the backward pass.
     """
 
     @staticmethod
-    def forward(ctx, phases, factors, amplitude, weights):
+    def forward(ctx, phases, factors, amplitude, onto):
         ctx.save_for_backward(phases, factors, amplitude)
-        ctx.weights = weights
-        grids = [weights.forward(values.mul_(amplitude)) for factor in factors.T for values in _sines(factor, phases)]
+        ctx.onto = onto
+        grids = [onto.forward(values.mul_(amplitude)) for factor in factors.T for values in _sines(factor, phases)]
         return torch.stack(grids[::2] + grids[1::2]).unflatten(0, (2, -1))
 
     @staticmethod
@@ -563,7 +589,7 @@ class _PixelField(torch.autograd.Function):
         d_phases = torch.zeros_like(phases)
         d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
         for index, factor in enumerate(factors.T):
-            onto_re, onto_im = (ctx.weights.adjoint(part[index]) for part in grad)
+            onto_re, onto_im = (ctx.onto.adjoint(part[index]) for part in grad)
             cosine, sine = _sines(factor, phases)
             if d_amplitude is not None:
                 d_amplitude.addcmul_(cosine, onto_re).addcmul_(sine, onto_im)
@@ -579,16 +605,3 @@ def _sines(factor: Tensor, phases: Tensor) -> Pair:
     for own, phase in zip(factor[1:], phases[1:], strict=True):
         angle.addcmul_(own, phase)
     return sines(angle)
-
-
-def to_pixels(intensity: Tensor, query: Query, *, per_pixel: float, reach: int) -> Tensor:
-    """Mean intensity over each pixel (or its value at the centre), (..., 2K+1, 2K+1) -> (..., H, W)."""
-    rows, columns = (
-        sampling.pixel_box(n, per_pixel=per_pixel, reach=reach, active=query.active)
-        if query.integrate
-        else sampling.point_comb(n, reach=reach)
-        for n in query.shape
-    )
-    if not query.integrate and query.shape[0] == query.shape[1] and query.shape[0] == 2 * reach + 1:
-        return intensity
-    return rows.to(intensity) @ intensity @ columns.to(intensity).mT

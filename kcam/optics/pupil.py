@@ -14,7 +14,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -199,12 +198,6 @@ def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing
     return quadrant
 
 
-def unfold_quadrant(quadrant: Tensor) -> Tensor:
-    """The whole symmetric grid (..., 2n, 2n) of one quadrant (..., n, n)."""
-    right = torch.cat([quadrant.flip(-1), quadrant], dim=-1)
-    return torch.cat([right.flip(-2), right], dim=-2)
-
-
 @functools.lru_cache(maxsize=1)
 def _low_pass_integral() -> tuple[np.ndarray, np.ndarray]:
     """Running integral of the map low-pass, tabulated: (offsets in samples, integral from -inf)."""
@@ -300,34 +293,6 @@ class MapWeights:
         """From the dense matrix (n, N)."""
         banded = (_Banded.build(m, dtype=dtype, device=device) for m in (matrix, matrix.T))
         return MapWeights(*banded)
-
-
-class Onto(Protocol):
-    """A linear map of pixels onto the pupil grid, with its transpose."""
-
-    def forward(self, field: Tensor) -> Tensor:
-        """(n, n) -> (N, N)."""
-
-    def adjoint(self, grid: Tensor) -> Tensor:
-        """(N, N) -> (n, n)."""
-
-
-class _MapOnto(torch.autograd.Function):
-    """`MapWeights.forward` with its adjoint."""
-
-    @staticmethod
-    def forward(ctx, field, weights):
-        ctx.weights = weights
-        return weights.forward(field)
-
-    @staticmethod
-    def backward(ctx, grad):
-        return ctx.weights.adjoint(grad), None
-
-
-def map_onto(field: Tensor, weights: Onto) -> Tensor:
-    """A map of pixels (n, n) on the pupil grid (N, N); differentiable in the map."""
-    return _MapOnto.apply(field, weights)
 
 
 @functools.lru_cache(maxsize=6)

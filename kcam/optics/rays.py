@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from kcam.optics.psf import Query, residual_path
-from kcam.optics.pupil import pixel_under, round_weights, unfold_quadrant
+from kcam.optics.pupil import pixel_under, round_weights
+from kcam.optics.quadrants import unfold
 
 
 def geometric_psf(query: Query) -> Tensor:
@@ -30,7 +31,7 @@ def geometric_psf(query: Query) -> Tensor:
     slopes_x, slopes_y = (torch.stack([torch.zeros_like(x) if s[i] is None else s[i] for s in slopes]) for i in (0, 1))
     if query.lens.round:
         quadrant = round_weights(query.lens.aperture.discs(), count, spacing=spacing)
-        power = unfold_quadrant(quadrant).to(query.device)
+        power = unfold(quadrant).to(query.device)
     else:
         mask = query.aperture_pixels().to(axis)
         power = pixel_under(mask, None, axis * query.semi_aperture, query.semi_aperture) ** 2

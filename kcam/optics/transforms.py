@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcam.optics.quadrants import join, split, split_adjoint, unfold
 from kcam.precision import full_precision
 
 Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
@@ -44,7 +45,10 @@ class Transform(Protocol):
         """Pupil maps (..., N, N) in this transform's layout."""
 
     def disarrange(self, maps: Tensor) -> Tensor:
-        """The inverse of `arrange`."""
+        """The inverse of `arrange`, and its transpose."""
+
+    def arrange_even(self, quadrant: Tensor) -> Tensor:
+        """Maps that are even in x and y, given for x, y > 0 (..., N / 2, N / 2); broadcastable to the layout."""
 
     def forward(self, pupil: Pair) -> Pair:
         """Field on the points, up to a phase that |U|^2 does not see."""
@@ -52,14 +56,14 @@ class Transform(Protocol):
     def adjoint(self, field: Pair) -> Pair:
         """Conjugate transpose of `forward`."""
 
-    def assemble(self, intensity: Tensor) -> Tensor:
-        """Intensity as an image (..., 2K+1, 2K+1)."""
-
-    def scatter(self, image: Tensor) -> Tensor:
-        """Transpose of `assemble`."""
-
     def arrange_points(self, image: Tensor) -> Tensor:
         """An image (2K+1, 2K+1) of values at the points, in the layout of the field."""
+
+    def quadrants(self, values: Tensor) -> Tensor:
+        """Values in the layout of the field as `split` gives an image, (..., 4, K+1, K+1)."""
+
+    def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
+        """Transpose of `quadrants`."""
 
 
 @dataclass(frozen=True)
@@ -81,22 +85,20 @@ class MatrixTransform:
         return MatrixTransform(torch.stack([angle.cos(), angle.sin()]).to(like))
 
     def arrange(self, maps: Tensor) -> Tensor:
-        n = maps.shape[-1] // 2
-        low, high = maps[..., :n, :].flip(-2), maps[..., n:, :]
-        return torch.stack([high[..., n:], high[..., :n].flip(-1), low[..., n:], low[..., :n].flip(-1)], dim=-3)
+        return split(maps)
 
     def disarrange(self, maps: Tensor) -> Tensor:
-        pp, pm, mp, mm = maps.unbind(-3)
-        high = torch.cat([pm.flip(-1), pp], dim=-1)
-        low = torch.cat([mm.flip(-1), mp], dim=-1)
-        return torch.cat([low.flip(-2), high], dim=-2)
+        return join(maps, odd=False)
+
+    def arrange_even(self, quadrant: Tensor) -> Tensor:
+        return quadrant.unsqueeze(-3)
 
     def forward(self, pupil: Pair) -> Pair:
         batch, _, n, _ = pupil[0].shape
         k = self.cosine_sine.shape[-1]
         folded = pupil[0].new_empty(2, 2, 2, batch, n, n)  # parity in x, parity in y, re/im, batch, v, u
         for part, values in enumerate(pupil):
-            pp, pm, mp, mm = values.unbind(1)
+            pp, pm, mp, mm = values.expand(-1, 4, -1, -1).unbind(1)
             over, under = (pp + pm, mp + mm), (pp - pm, mp - mm)
             for parity_x, (high, low) in enumerate((over, under)):
                 torch.add(high, low, out=folded[parity_x, 0, part])
@@ -143,23 +145,13 @@ class MatrixTransform:
             pupil.append(torch.stack([even[0] + odd[0], even[1] + odd[1], even[0] - odd[0], even[1] - odd[1]], dim=1))
         return pupil[0], pupil[1]
 
-    def assemble(self, intensity: Tensor) -> Tensor:
-        pp, pm, mp, mm = intensity.unbind(-3)
-        down = torch.cat([pm[..., 1:].flip(-1), pp], dim=-1)
-        up = torch.cat([mm[..., 1:].flip(-1), mp], dim=-1)
-        return torch.cat([up[..., 1:, :].flip(-2), down], dim=-2)
-
-    def scatter(self, image: Tensor) -> Tensor:
-        k = self.cosine_sine.shape[-1] - 1
-        down, up = image[..., k:, :], image[..., :k, :].flip(-2)
-        up = torch.nn.functional.pad(up, (0, 0, 1, 0))  # the axis belongs to the positive side
-        left = [torch.nn.functional.pad(half[..., :k].flip(-1), (1, 0)) for half in (down, up)]
-        return torch.stack([down[..., k:], left[0], up[..., k:], left[1]], dim=-3)
-
     def arrange_points(self, image: Tensor) -> Tensor:
-        k = self.cosine_sine.shape[-1] - 1
-        up, down = image[: k + 1].flip(0), image[k:]
-        return torch.stack([down[:, k:], down[:, : k + 1].flip(1), up[:, k:], up[:, : k + 1].flip(1)])
+        return split(image)
+
+    def quadrants(self, values: Tensor) -> Tensor:
+        return values
+
+    quadrants_adjoint = quadrants
 
 
 @dataclass(frozen=True)
@@ -169,7 +161,16 @@ class _PlainLayout:
     def arrange(self, maps: Tensor) -> Tensor:
         return maps
 
-    disarrange = assemble = scatter = arrange_points = arrange
+    disarrange = arrange_points = arrange
+
+    def arrange_even(self, quadrant: Tensor) -> Tensor:
+        return unfold(quadrant)
+
+    def quadrants(self, values: Tensor) -> Tensor:
+        return split(values)
+
+    def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
+        return split_adjoint(quadrants, odd=True)
 
 
 @dataclass(frozen=True)
@@ -349,14 +350,17 @@ class CurvedTransform:
     def disarrange(self, maps: Tensor) -> Tensor:
         return self.inner.disarrange(maps)
 
-    def assemble(self, intensity: Tensor) -> Tensor:
-        return self.inner.assemble(intensity)
-
-    def scatter(self, image: Tensor) -> Tensor:
-        return self.inner.scatter(image)
+    def arrange_even(self, quadrant: Tensor) -> Tensor:
+        return self.inner.arrange_even(quadrant)
 
     def arrange_points(self, image: Tensor) -> Tensor:
         return self.inner.arrange_points(image)
+
+    def quadrants(self, values: Tensor) -> Tensor:
+        return self.inner.quadrants(values)
+
+    def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
+        return self.inner.quadrants_adjoint(quadrants)
 
 
 def _times_power_of_i(values: Pair, power: int) -> Pair:
@@ -365,98 +369,89 @@ def _times_power_of_i(values: Pair, power: int) -> Pair:
 
 
 class _PupilIntensity(torch.autograd.Function):
-    """|transform(amplitude * field * exp(i coefficients @ maps))|^2 for each group, nothing kept but U."""
+    """|transform(amplitude * field * exp(i coefficients @ maps))|^2 for each group, nothing kept but U.
+
+    maps, amplitude and field (2, G, ...) are in the transforms' layout, the first two perhaps of even maps.
+    """
 
     @staticmethod
-    def forward(ctx, coefficients, maps, amplitude, field_re, field_im, scales, tau, transforms, nodes, step):
-        first = transforms[0]
-        laid = first.arrange(maps), first.arrange(amplitude)
-        fields = None if field_re is None else (first.arrange(field_re), first.arrange(field_im))
-        images, kept = [], []
+    def forward(ctx, coefficients, maps, amplitude, field, scales, tau, transforms, nodes, step):
+        quadrants, kept = [], []
         for group, transform in enumerate(transforms):
-            pupil = _pupil(coefficients[group], laid, fields, group)
+            pupil = _pupil(coefficients[group], maps, amplitude, None if field is None else field[:, group])
             re, im = transform.forward(pupil)
-            images.append(transform.assemble(re.square() + im.square()))  # never abs()**2: its gradient is NaN at 0
+            # never abs()**2: its gradient is NaN at 0
+            quadrants.append(transform.quadrants(re.square().addcmul_(im, im)))
             kept += [re, im]
         ctx.transforms, ctx.nodes, ctx.step = transforms, nodes, step
-        ctx.has_field = field_re is not None
-        fields_kept = (field_re, field_im) if ctx.has_field else ()
-        ctx.save_for_backward(coefficients, maps, amplitude, scales, tau, *fields_kept, *kept)
-        return torch.stack(images)
+        ctx.save_for_backward(coefficients, maps, amplitude, field, scales, tau, *kept)
+        return torch.stack(quadrants)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        coefficients, maps, amplitude, scales, tau, *rest = ctx.saved_tensors
-        first = ctx.transforms[0]
-        laid = first.arrange(maps), first.arrange(amplitude)
-        fields = None
-        if ctx.has_field:
-            fields, rest = (first.arrange(rest[0]), first.arrange(rest[1])), rest[2:]
-        need_coefficients, need_maps, need_amplitude, need_field, _, need_scale, need_tau = ctx.needs_input_grad[:7]
+        coefficients, maps, amplitude, field, scales, tau, *kept = ctx.saved_tensors
+        need_coefficients, need_maps, need_amplitude, need_field, need_scales, need_tau = ctx.needs_input_grad[:6]
         d_coefficients = torch.empty_like(coefficients)
-        d_maps = torch.zeros_like(laid[0]) if need_maps else None
-        d_amplitude = torch.zeros_like(laid[1]) if need_amplitude else None
-        d_field = ([], [])
-        d_scale = []
+        d_maps = torch.zeros_like(maps)
+        d_amplitude = torch.zeros_like(amplitude)
+        d_field = torch.empty_like(field) if need_field else None
+        d_scales = torch.empty_like(scales)
         d_tau = torch.zeros_like(tau)
         q2 = 1 + tau * (ctx.nodes[:, None] ** 2 + ctx.nodes**2).to(tau)
+        reach = grad.shape[-1] - 1
+        points = torch.arange(-reach, reach + 1, device=grad.device) * ctx.step
         with full_precision(grad.device):
             for group, transform in enumerate(ctx.transforms):
-                re, im = rest[2 * group], rest[2 * group + 1]
-                weight = 2 * transform.scatter(grad[group])
-                d_re, d_im = transform.adjoint((weight * re, weight * im))
-                pupil = _pupil(coefficients[group], laid, fields, group)
-                # P = A F exp(i phi): d phi = Re(conj(dP) i P) = d_im Re P - d_re Im P
-                d_phase = d_im * pupil[0] - d_re * pupil[1]
-                flat = d_phase.flatten(1)
-                d_coefficients[group] = flat @ laid[0].flatten(1).T
-                if need_maps:
-                    d_maps += (coefficients[group].T @ flat).view_as(d_maps)
-                if need_amplitude or need_field:
-                    bare = _pupil(coefficients[group], (laid[0], None), None, group)  # exp(i phi)
-                    # onto A F: conj(exp(i phi)) dP
-                    turned = (bare[0] * d_re + bare[1] * d_im, bare[0] * d_im - bare[1] * d_re)
-                    if need_field:
-                        for part in range(2):
-                            d_field[part].append((turned[part] * laid[1]).sum(0))
-                    if need_amplitude:
-                        onto = turned[0]
-                        if fields is not None:
-                            onto = turned[0] * fields[0][group] + turned[1] * fields[1][group]
-                        d_amplitude += onto if d_amplitude.shape[0] == onto.shape[0] else onto.sum(0, keepdim=True)
+                re, im = kept[2 * group], kept[2 * group + 1]
+                weight = 2 * transform.quadrants_adjoint(grad[group])
                 d_u = (weight * re, weight * im)
-                if need_scale:  # the kernel's exponent is -i s (x xi + y eta) / q
-                    d_scale.append(_kernel_gradient(transform, pupil, d_u, ctx.nodes, ctx.step, q2.rsqrt()))
+                d_pupil = transform.adjoint(d_u)
+                own = None if field is None else field[:, group]
+                phasor = _pupil(coefficients[group], maps, None, None)
+                if need_amplitude:
+                    onto = _turned_back(d_pupil, phasor)
+                    into = onto[0] if own is None else onto[0] * own[0] + onto[1] * own[1]
+                    d_amplitude += into.sum_to_size(d_amplitude.shape)
+                if need_field or need_coefficients or need_maps:
+                    onto = _turned_back(d_pupil, (phasor[0] * amplitude, phasor[1] * amplitude))
+                    if need_field:
+                        for part, values in zip(d_field[:, group], onto, strict=True):
+                            torch.sum(values, dim=0, out=part)
+                    if need_coefficients or need_maps:  # of the phase: Im(conj(F) dF)
+                        d_phase = onto[1] if own is None else onto[1] * own[0] - onto[0] * own[1]
+                        flat = d_phase.sum_to_size(phasor[0].shape).flatten(1)
+                        d_coefficients[group] = flat @ maps.flatten(1).T
+                        if need_maps:
+                            d_maps += (coefficients[group].T @ flat).view_as(d_maps)
+                if need_scales or need_tau:
+                    pupil = _pupil(coefficients[group], maps, amplitude, own)
+                if need_scales:  # the kernel's exponent is -i s (x xi + y eta) / q
+                    d_scales[group] = _kernel_gradient(transform, pupil, d_u, ctx.nodes, points, q2.rsqrt())
                 if need_tau:  # d(1 / q) / d tau = (1 - q^2) / (2 tau q^3)
                     slope = -(ctx.nodes[:, None] ** 2 + ctx.nodes**2).to(tau) / (2 * q2**1.5)
-                    d_tau += scales[group] * _kernel_gradient(transform, pupil, d_u, ctx.nodes, ctx.step, slope)
-        return (
-            d_coefficients if need_coefficients else None,
-            first.disarrange(d_maps) if need_maps else None,
-            first.disarrange(d_amplitude) if need_amplitude else None,
-            first.disarrange(torch.stack(d_field[0])) if need_field else None,
-            first.disarrange(torch.stack(d_field[1])) if need_field else None,
-            torch.stack(d_scale) if need_scale else None,
-            d_tau if need_tau else None,
-            None,
-            None,
-            None,
-        )
+                    d_tau += scales[group] * _kernel_gradient(transform, pupil, d_u, ctx.nodes, points, slope)
+        found = (d_coefficients, d_maps, d_amplitude, d_field, d_scales, d_tau)
+        needed = (d if need else None for d, need in zip(found, ctx.needs_input_grad, strict=False))
+        return *needed, None, None, None
 
 
-def _pupil(coefficients: Tensor, laid: tuple[Tensor, Tensor | None], fields: Pair | None, group: int) -> Pair:
-    """Real and imaginary part of amplitude * field * exp(i phase) for the distances of one group."""
-    maps, amplitude = laid
+def _pupil(coefficients: Tensor, maps: Tensor, amplitude: Tensor | None, field: Tensor | None) -> Pair:
+    """Real and imaginary part of amplitude * field * exp(i coefficients @ maps) for the distances of one group."""
     phase = (coefficients @ maps.flatten(1)).view(coefficients.shape[0], *maps.shape[1:])
     re, im = sines(phase)
     if amplitude is not None:
-        re *= amplitude
-        im *= amplitude
-    if fields is None:
+        re = re * amplitude
+        im = im * amplitude
+    if field is None:
         return re, im
-    f_re, f_im = fields[0][group], fields[1][group]
-    return re * f_re - im * f_im, re * f_im + im * f_re
+    return re * field[0] - im * field[1], re * field[1] + im * field[0]
+
+
+def _turned_back(values: Pair, phasor: Pair) -> Pair:
+    """Values times the conjugate of a phasor."""
+    (re, im), (cosine, sine) = values, phasor
+    return cosine * re + sine * im, cosine * im - sine * re
 
 
 def sines(angle: Tensor) -> Pair:
@@ -472,17 +467,17 @@ def sines(angle: Tensor) -> Pair:
 
 
 def _kernel_gradient(
-    transform: Transform, pupil: Pair, d_field: Pair, nodes: Tensor, step: float, slope: Tensor
+    transform: Transform, pupil: Pair, d_field: Pair, nodes: Tensor, points: Tensor, slope: Tensor
 ) -> Tensor:
     """d(loss) for d(kernel's exponent) = -i (x xi + y eta) slope: dU = -i (x T[xi slope P] + y T[eta slope P])."""
     total = pupil[0].new_zeros(())
     grid = nodes.to(pupil[0])
-    for axis in range(2):
-        ramp = transform.arrange((grid[None, :] if axis == 0 else grid[:, None]) * slope.to(grid))
+    for along_x in (True, False):
+        ramp, position = (v[None, :] if along_x else v[:, None] for v in (grid, points.to(grid)))
+        ramp = transform.arrange(ramp * slope.to(grid))
+        position = transform.arrange_points(position.expand(points.numel(), points.numel()))
         re, im = transform.forward((pupil[0] * ramp, pupil[1] * ramp))
-        product = transform.assemble(d_field[0] * im - d_field[1] * re)  # Re(conj(dU) (-i) T)
-        points = (torch.arange(product.shape[-1], device=grid.device) - product.shape[-1] // 2).to(grid) * step
-        total = total + (product * (points if axis == 0 else points[:, None])).sum()
+        total = total + ((d_field[0] * im - d_field[1] * re) * position).sum()  # Re(conj(dU) (-i) T)
     return total
 
 
@@ -491,7 +486,7 @@ def pupil_intensity(
     *,
     maps: Tensor,
     amplitude: Tensor,
-    field: Pair | None,
+    field: Tensor | None,
     scales: Tensor,
     transforms: Sequence[Transform],
     nodes: Tensor,
@@ -502,15 +497,20 @@ def pupil_intensity(
 
     Args:
         coefficients: (G, Z, T) of the phase's maps [rad per unit of the map]; G groups share a kernel.
-        maps: (T, N, N). amplitude: (1 or Z, N, N), quadrature weights included.
-        field: real and imaginary part (G, N, N) of what does not fit into a phase (a low-passed pixel map), or None.
+        maps: (T, N, N), or for x, y > 0 alone where all are even, (T, N / 2, N / 2).
+        amplitude: (1 or Z, ...) likewise, quadrature weights included.
+        field: real and imaginary part of what does not fit into a phase (a low-passed pixel map), (2, G, ...) in the
+            transforms' layout, or None.
         scales: (G,) kernel scales s [1/m], for their gradient. transforms: one for each group, built with that scale.
         nodes: (N,) normalised nodes; step: distance of the points [m].
         tau: 0-d, the curvature that `CurvedTransform`s were built with, for its gradient; None: straight kernels.
     Returns:
-        (G, Z, 2K+1, 2K+1); differentiable once in all tensors.
+        Quadrants of the intensity (G, Z, 4, K + 1, K + 1), as `split` has them; differentiable once in all tensors.
     """
-    re, im = field if field is not None else (None, None)
+    layout = transforms[0]
+    maps, amplitude = (
+        layout.arrange(m) if m.shape[-1] == nodes.numel() else layout.arrange_even(m) for m in (maps, amplitude)
+    )
     with full_precision(coefficients.device):
         curvature = torch.zeros_like(scales[0]) if tau is None else tau.to(scales)
-        return _PupilIntensity.apply(coefficients, maps, amplitude, re, im, scales, curvature, transforms, nodes, step)
+        return _PupilIntensity.apply(coefficients, maps, amplitude, field, scales, curvature, transforms, nodes, step)
