@@ -115,17 +115,22 @@ def _kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.nd
     return np.where(np.abs(offset) < half_width, np.sinc(offset) * np.i0(beta * np.sqrt(inside)) / np.i0(beta), 0.0)
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=4)
 @torch.inference_mode(False)
-def disc_coverage(cells: int, *, half_width: float, radius: float = 1.0) -> Tensor:
-    """Share of each cell of a square grid that lies inside a centred disc, (cells, cells) float64, exact.
+def disc_coverage(
+    discs: tuple[tuple[float, float], ...], cells: int, *, half_width: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Share of each cell of a square grid that lies inside centred discs (radius, weight), (cells, cells), exact.
 
-    half_width: of the grid, in the unit of the radius.
+    half_width: of the grid, in the unit of the radii.
     """
-    edges = np.linspace(-half_width, half_width, cells + 1) / radius
-    sign = np.sign(edges)
-    area = _disc_area_below(np.abs(edges)[:, None], np.abs(edges)[None, :]) * sign[:, None] * sign[None, :]
-    return torch.as_tensor(np.diff(np.diff(area, axis=0), axis=1) / (edges[1] - edges[0]) ** 2).clamp_(0, 1)
+    total = np.zeros((cells, cells))
+    for radius, weight in discs:
+        edges = np.linspace(-half_width, half_width, cells + 1) / radius
+        sign = np.sign(edges)
+        area = _disc_area_below(np.abs(edges)[:, None], np.abs(edges)[None, :]) * sign[:, None] * sign[None, :]
+        total += weight * (np.diff(np.diff(area, axis=0), axis=1) / (edges[1] - edges[0]) ** 2).clip(0, 1)
+    return torch.as_tensor(total).to(device, dtype)
 
 
 def square_coverage(cells: int, *, half_width: float) -> Tensor:
@@ -253,9 +258,9 @@ class _Banded:
     @staticmethod
     def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> _Banded:
         """Cut the bands out of a dense matrix."""
-        inputs, outputs = matrix.shape
+        outputs = matrix.shape[1]
         slabs, starts = [], []
-        for columns in matrix.split(max(_SLAB_COLUMNS, _SLAB_COLUMNS * outputs // inputs), dim=1):
+        for columns in matrix.split(_SLAB_COLUMNS, dim=1):
             rows = (columns != 0).any(1).nonzero().flatten()
             low, high = (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 1)
             slabs.append(columns[low:high].to(device, dtype))
