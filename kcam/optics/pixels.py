@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcam.optics import sampling
 from kcam.optics.linear import apply_linear
-from kcam.optics.quadrants import join, join_adjoint, parities
+from kcam.optics.quadrants import by_x, join, join_adjoint, parities
 
 
 def to_pixels(
@@ -80,15 +80,9 @@ class _PixelSums:
     def _along_both(self, quadrants: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         count, _, length, width = quadrants.shape
         folded = quadrants.new_empty(2, 2, count, length, width)  # parity in x, parity in y
-        parities(_by_x(quadrants), out=folded.flatten(0, 1))
+        parities(by_x(quadrants), out=folded.flatten(0, 1))
         along_x = torch.bmm(folded.view(2, -1, width), columns.mT).view(*folded.shape[:-1], columns.shape[-2])
         sums = [rows[y] @ along_x[x, y] for x, y in itertools.product(range(2), range(2))]
         result = quadrants.new_empty(count, 4, *sums[0].shape[1:])
-        parities(sums, out=_by_x(result))
+        parities(sums, out=by_x(result))
         return result
-
-
-def _by_x(quadrants: Tensor) -> tuple[Tensor, ...]:
-    """Quadrants (B, 4, h, w) in the order ++, -+, +-, --: the sign of x outermost."""
-    pp, pm, mp, mm = quadrants.unbind(1)
-    return pp, mp, pm, mm

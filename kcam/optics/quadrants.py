@@ -70,3 +70,9 @@ def parities(quadrants: Sequence[Tensor], out: Sequence[Tensor]) -> None:
     torch.sub(c, d, out=right)
     torch.add(left, right, out=out[1])
     torch.sub(left, right, out=out[3])
+
+
+def by_x(quadrants: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Quadrants (B, 4, h, w) in the order ++, -+, +-, --, whose `parities` are by x first, then by y."""
+    pp, pm, mp, mm = quadrants.unbind(1)
+    return pp, mp, pm, mm

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.quadrants import join, split, split_adjoint, unfold
+from kcam.optics.quadrants import by_x, join, parities, split, split_adjoint, unfold
 from kcam.precision import full_precision
 
 Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
@@ -98,51 +98,32 @@ class MatrixTransform:
         k = self.cosine_sine.shape[-1]
         folded = pupil[0].new_empty(2, 2, 2, batch, n, n)  # parity in x, parity in y, re/im, batch, v, u
         for part, values in enumerate(pupil):
-            pp, pm, mp, mm = values.expand(-1, 4, -1, -1).unbind(1)
-            over, under = (pp + pm, mp + mm), (pp - pm, mp - mm)
-            for parity_x, (high, low) in enumerate((over, under)):
-                torch.add(high, low, out=folded[parity_x, 0, part])
-                torch.sub(high, low, out=folded[parity_x, 1, part])
+            parities(by_x(values.expand(-1, 4, -1, -1)), out=folded[:, :, part].flatten(0, 1))
         along_x = torch.bmm(folded.view(2, 4 * batch * n, n), self.cosine_sine)
         by_v = along_x.view(2, 2, 2 * batch, n, k).permute(1, 3, 0, 2, 4).reshape(2, n, 4 * batch * k)
-        parts = torch.bmm(self.cosine_sine.mT, by_v).view(
-            2, k, 2, 2, batch, k
-        )  # parity y, y, parity x, re/im, batch, x
-        (ee_r, ee_i), (eo_r, eo_i) = parts[0, :, 0].unbind(1), parts[0, :, 1].unbind(1)
-        (oe_r, oe_i), (oo_r, oo_i) = parts[1, :, 0].unbind(1), parts[1, :, 1].unbind(1)
+        parts = torch.bmm(self.cosine_sine.mT, by_v).view(2, k, 2, 2, batch, k)
+        re, im = (pupil[0].new_empty(batch, 4, k, k) for _ in range(2))
         # U(+-y, +-x) = ee -+ i eo -+ i oe -+ oo: the odd parts carry -i for each of their axes
-        real = self._combine(ee_r, oo_r, eo_i, oe_i)
-        imaginary = self._combine(ee_i, oo_i, -eo_r, -oe_r)
-        return real, imaginary
-
-    @staticmethod
-    def _combine(even: Tensor, odd: Tensor, odd_x: Tensor, odd_y: Tensor) -> Tensor:
-        difference, total = even - odd, even + odd
-        both, cross = odd_x + odd_y, odd_y - odd_x
-        return torch.stack([difference + both, total + cross, total - cross, difference - both]).permute(2, 0, 1, 3)
+        (ee_re, ee_im), (eo_re, eo_im) = parts[0].permute(1, 2, 3, 0, 4)  # even in y; by parity in x, re/im
+        (oe_re, oe_im), (oo_re, oo_im) = parts[1].permute(1, 2, 3, 0, 4)
+        _join_parts((ee_re, eo_im, oe_im, oo_re), out=re.unbind(1))
+        _join_parts((ee_im, eo_re, oe_re, oo_im), out=im.unbind(1)[::-1])  # -i turns their signs
+        return re, im
 
     def adjoint(self, field: Pair) -> Pair:
         batch, _, k, _ = field[0].shape
         n = self.cosine_sine.shape[1]
         parts = field[0].new_empty(2, k, 2, 2, batch, k)
-        for part, values in enumerate(field):
-            pp, pm, mp, mm = values.transpose(0, 1).transpose(1, 2).unbind(0)  # each (y, batch, x)
-            parts[0, :, 0, part] = pp + pm + mp + mm
-            parts[1, :, 1, part] = pm + mp - pp - mm
-            # transposes of the terms in eo and oe: real parts took +im, imaginary parts took -re
-            odd_x, odd_y = pp - pm + mp - mm, pp + pm - mp - mm
-            if part == 0:
-                parts[0, :, 1, 1], parts[1, :, 0, 1] = odd_x, odd_y
-            else:
-                parts[0, :, 1, 0], parts[1, :, 0, 0] = -odd_x, -odd_y
+        (ee_re, ee_im), (eo_re, eo_im) = parts[0].permute(1, 2, 3, 0, 4)
+        (oe_re, oe_im), (oo_re, oo_im) = parts[1].permute(1, 2, 3, 0, 4)
+        _part(field[0].unbind(1), out=(ee_re, eo_im, oe_im, oo_re))
+        _part(field[1].unbind(1)[::-1], out=(ee_im, eo_re, oe_re, oo_im))
         by_v = torch.bmm(self.cosine_sine, parts.view(2, k, 4 * batch * k))
         along_x = by_v.view(2, n, 2, 2 * batch, k).permute(2, 0, 3, 1, 4).reshape(2, 4 * batch * n, k)
         folded = torch.bmm(along_x, self.cosine_sine.mT).view(2, 2, 2, batch, n, n)
-        pupil = []
-        for part in range(2):
-            (ee, eo), (oe, oo) = folded[0, :, part], folded[1, :, part]  # [parity x, parity y]
-            even, odd = (ee + oe, ee - oe), (eo + oo, eo - oo)  # x > 0, x < 0
-            pupil.append(torch.stack([even[0] + odd[0], even[1] + odd[1], even[0] - odd[0], even[1] - odd[1]], dim=1))
+        pupil = tuple(field[0].new_empty(batch, 4, n, n) for _ in range(2))
+        for part, values in enumerate(pupil):
+            parities(folded[:, :, part].flatten(0, 1), out=by_x(values))
         return pupil[0], pupil[1]
 
     def arrange_points(self, image: Tensor) -> Tensor:
@@ -152,6 +133,28 @@ class MatrixTransform:
         return values
 
     quadrants_adjoint = quadrants
+
+
+def _join_parts(parts: Sequence[Tensor], out: Sequence[Tensor]) -> None:
+    """even - odd + (odd_x + odd_y) and so on for each quadrant, from (even, odd_x, odd_y, odd in both)."""
+    even, odd_x, odd_y, odd = parts
+    agree, differ = even - odd, even + odd
+    total, cross = odd_x + odd_y, odd_y - odd_x
+    torch.add(agree, total, out=out[0])
+    torch.add(differ, cross, out=out[1])
+    torch.sub(differ, cross, out=out[2])
+    torch.sub(agree, total, out=out[3])
+
+
+def _part(quadrants: Sequence[Tensor], out: Sequence[Tensor]) -> None:
+    """The transpose of `_join_parts`."""
+    pp, pm, mp, mm = quadrants
+    agree, differ = pp + mm, pm + mp
+    total, cross = pp - mm, pm - mp
+    torch.add(agree, differ, out=out[0])
+    torch.sub(total, cross, out=out[1])
+    torch.add(total, cross, out=out[2])
+    torch.sub(differ, agree, out=out[3])
 
 
 @dataclass(frozen=True)
