@@ -7,6 +7,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from kcam.precision import full_precision
+
 
 class LinearMap(Protocol):
     """A linear map with its transpose."""
@@ -20,16 +22,23 @@ class LinearMap(Protocol):
 
 class _Apply(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, values, linear):
-        ctx.linear = linear
-        return linear.forward(values)
+    def forward(values, linear, transposed):
+        with full_precision(values.device):
+            return linear.adjoint(values) if transposed else linear.forward(values)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    def setup_context(ctx, inputs, output):
+        _, ctx.linear, ctx.transposed = inputs
+
+    @staticmethod
     def backward(ctx, grad):
-        return ctx.linear.adjoint(grad), None
+        return _Apply.apply(grad, ctx.linear, not ctx.transposed), None, None
+
+    @staticmethod
+    def jvp(ctx, tangent, *_):
+        return _Apply.apply(tangent, ctx.linear, ctx.transposed)
 
 
 def apply_linear(values: Tensor, linear: LinearMap) -> Tensor:
-    """linear.forward(values), differentiable once by its transpose."""
-    return _Apply.apply(values, linear)
+    """linear.forward(values), differentiable any number of times by the map's own transpose."""
+    return _Apply.apply(values, linear, False)

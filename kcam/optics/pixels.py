@@ -80,7 +80,7 @@ class _PixelSums:
     def _along_both(self, quadrants: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         count, _, length, width = quadrants.shape
         folded = quadrants.new_empty(2, 2, count, length, width)  # parity in x, parity in y
-        parities(by_x(quadrants), out=folded.flatten(0, 1))
+        parities(by_x(quadrants), out=folded.flatten(0, 1).unbind())
         along_x = torch.bmm(folded.view(2, -1, width), columns.mT).view(*folded.shape[:-1], columns.shape[-2])
         sums = [rows[y] @ along_x[x, y] for x, y in itertools.product(range(2), range(2))]
         result = quadrants.new_empty(count, 4, *sums[0].shape[1:])

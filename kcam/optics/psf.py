@@ -51,12 +51,13 @@ from kcam.optics.transforms import (
     sines,
 )
 from kcam.optics.warp import Warp
+from kcam.precision import full_precision
 
 if TYPE_CHECKING:
     from kcam.optics.lens import Lens
 
 _GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
-_MOST_NODES = 16  # of a quadrature of the energy that passes pixel maps
+_MOST_NODES = 16  # of the quadrature of the energy that passes pixel maps
 _MOST_CELLS = 3072  # on which several maps are brought together exactly, beyond by the nearest pixel; and the rim
 
 
@@ -441,12 +442,12 @@ class _Cells:
     def energy(self, semi_aperture: Tensor, vergences: Tensor) -> Tensor:
         """INT power / (1 + V^2 r^2) d^2 u of spherical waves, (Z,) [m^2].
 
-        1 / (1 + s) = INT exp(-t) exp(-s t) dt by Gauss and Laguerre, whose terms are products over x and y: 1e-10 off,
-        or with the most nodes 2e-6 where a source is as near as 0.7 semi-apertures.
+        1 / (1 + s) = INT exp(-t) exp(-s t) dt by n nodes of Gauss and Laguerre, whose terms are products over x and y.
+        The error is (s / (2 + s))^2n: 1e-10, or with the most nodes 2e-6 for a source as near as 0.7 semi-apertures.
         """
         largest = 2 * float((vergences.detach() * semi_aperture.detach()).abs().max()) ** 2
-        share = max(largest / (2 + largest), 1e-12)
-        nodes = min(_MOST_NODES, math.ceil(math.log(1e-10) / (2 * math.log(share))))
+        ratio = max(largest / (2 + largest), 1e-12)
+        nodes = math.ceil(math.log(1e-10) / (2 * math.log(ratio))) if ratio < 0.4 else _MOST_NODES
         times, weights = (torch.as_tensor(v).to(vergences) for v in np.polynomial.laguerre.laggauss(nodes))
         count = self.power.shape[-1]
         pitch = 2 * self.half_width / count * semi_aperture
@@ -512,8 +513,8 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     weights = map_weights(
         cells, half_width=half_width, count=count, spacing=spacing, dtype=query.dtype, device=query.device
     )
-    factors = torch.stack(factors).to(query.dtype)
-    return _Cells(half_width, amplitude, power, torch.stack(phases), factors, weights)
+    dispersed = torch.stack(factors).to(query.dtype)
+    return _Cells(half_width, amplitude, power, torch.stack(phases), dispersed, weights)
 
 
 def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: float) -> Tensor:
@@ -599,7 +600,8 @@ class _PixelField(torch.autograd.Function):
         d_phases = torch.zeros_like(phases)
         d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
         for index, factor in enumerate(factors.T):
-            onto_re, onto_im = (ctx.onto.adjoint(part[index]) for part in grad)
+            with full_precision(grad.device):
+                onto_re, onto_im = (ctx.onto.adjoint(part[index]) for part in grad)
             cosine, sine = _sines(factor, phases)
             if d_amplitude is not None:
                 d_amplitude.addcmul_(cosine, onto_re).addcmul_(sine, onto_im)

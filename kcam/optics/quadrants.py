@@ -20,10 +20,8 @@ def split(grid: Tensor) -> Tensor:
     return torch.stack([high[..., right], high[..., left].flip(-1), low[..., right], low[..., left].flip(-1)], dim=-3)
 
 
-def split_adjoint(quadrants: Tensor, *, odd: bool) -> Tensor:
-    """Transpose of `split`: what belongs to several quadrants is their sum."""
-    if not odd:
-        return join(quadrants, odd=False)
+def split_adjoint(quadrants: Tensor) -> Tensor:
+    """Transpose of `split` of a grid of odd numbers: what belongs to several quadrants is their sum."""
     h, w = quadrants.shape[-2:]
     grid = quadrants.new_zeros(*quadrants.shape[:-3], 2 * h - 1, 2 * w - 1)
     pp, pm, mp, mm = quadrants.unbind(-3)

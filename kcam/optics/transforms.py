@@ -98,7 +98,7 @@ class MatrixTransform:
         k = self.cosine_sine.shape[-1]
         folded = pupil[0].new_empty(2, 2, 2, batch, n, n)  # parity in x, parity in y, re/im, batch, v, u
         for part, values in enumerate(pupil):
-            parities(by_x(values.expand(-1, 4, -1, -1)), out=folded[:, :, part].flatten(0, 1))
+            parities(by_x(values.expand(-1, 4, -1, -1)), out=folded[:, :, part].flatten(0, 1).unbind())
         along_x = torch.bmm(folded.view(2, 4 * batch * n, n), self.cosine_sine)
         by_v = along_x.view(2, 2, 2 * batch, n, k).permute(1, 3, 0, 2, 4).reshape(2, n, 4 * batch * k)
         parts = torch.bmm(self.cosine_sine.mT, by_v).view(2, k, 2, 2, batch, k)
@@ -123,7 +123,7 @@ class MatrixTransform:
         folded = torch.bmm(along_x, self.cosine_sine.mT).view(2, 2, 2, batch, n, n)
         pupil = tuple(field[0].new_empty(batch, 4, n, n) for _ in range(2))
         for part, values in enumerate(pupil):
-            parities(folded[:, :, part].flatten(0, 1), out=by_x(values))
+            parities(folded[:, :, part].flatten(0, 1).unbind(), out=by_x(values))
         return pupil[0], pupil[1]
 
     def arrange_points(self, image: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ class _PlainLayout:
         return split(values)
 
     def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
-        return split_adjoint(quadrants, odd=True)
+        return split_adjoint(quadrants)
 
 
 @dataclass(frozen=True)
