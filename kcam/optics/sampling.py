@@ -91,11 +91,3 @@ def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0)
         box[:, -beyond - 1] += box[:, -beyond:].sum(1)
         box = box[:, beyond:-beyond]
     return torch.as_tensor(np.ascontiguousarray(box))
-
-
-def point_comb(pixels: int, *, reach: int) -> Tensor:
-    """Selection of the pixel centres out of a grid of one point per pixel, in the place of `pixel_box`."""
-    comb = torch.zeros(pixels, 2 * reach + 1, dtype=torch.float64)
-    rows = torch.arange(pixels)
-    comb[rows, rows - pixels // 2 + reach] = 1
-    return comb
