@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from kcam.optics.psf import Query, residual_path
 from kcam.optics.pupil import Pupil, pixel_under, round_weights
-from kcam.optics.quadrants import split, unfold
+from kcam.optics.quadrants import unfold
 from kcam.optics.transforms import fast_length
 
 
@@ -95,7 +95,7 @@ def _spectrum_band(query: Query, index: int, *, count: int, pitch: float) -> Ten
     sensor = kernel @ spectrum @ kernel.T
     intensity = sensor.real.square() + sensor.imag.square()
     factor = query.pixel_pitch**2 / energy
-    return query.to_pixels(split(intensity), per_pixel=per_pixel) * factor[:, None, None].to(query.dtype)
+    return query.pixels(per_pixel).of_image(intensity) * factor[:, None, None].to(query.dtype)
 
 
 def _point_transmission(query: Query, pupil: Pupil, *, pitch: float, count: int) -> tuple[Tensor, Tensor]:

@@ -11,8 +11,9 @@ from scipy.special import fresnel
 from torch import Tensor
 
 from kcam.optics import sampling
+from kcam.optics.autograd import once_differentiable
 from kcam.optics.elements import zernike_sum
-from kcam.optics.pixels import to_pixels
+from kcam.optics.pixels import Pixels
 from kcam.optics.polar import legendre
 from kcam.optics.pupil import Pupil, disc_weights, grid_nodes, grid_spacing
 from kcam.optics.quadrants import unfold
@@ -150,11 +151,11 @@ def _aberrated(
             MatrixTransform.build(nodes, scale=float(s), step=step, reach=reach, like=like) for s in scales.detach()
         ],
         nodes=nodes,
-        step=step,
+        points=torch.arange(-reach, reach + 1) * step,
     )
     area = grid_spacing(count) ** 2 / float(weights.sum())
     factor = area * (a * pixel_pitch / (grid.to(device) * d)) ** 2  # (L,)
-    pixels = to_pixels(intensity, shape, per_pixel=per_pixel)
+    pixels = Pixels(shape, per_pixel).of_quadrants(intensity)
     return (pixels * factor[:, None, None, None].to(dtype)).transpose(0, 1)
 
 
@@ -278,9 +279,9 @@ class _Fresnel(torch.autograd.Function):
         return result
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        rim, chord, result = ctx.saved_tensors
+    @once_differentiable
+    def backward(ctx, saved, grad):
+        rim, chord, result = saved
         phase = rim * chord**2
         slope = torch.complex(torch.zeros_like(chord), chord**3 / 3)  # its limit in focus
         if abs(float(rim)) > 1e-4:

@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from kcam.cache import ValueCache
 from kcam.effects import Work
+from kcam.optics.autograd import once_differentiable
 from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 
@@ -437,9 +438,9 @@ class Contraction(torch.autograd.Function):
         )
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        planes, psfs, spectra, weights, kept, *held = ctx.saved_tensors
+    @once_differentiable
+    def backward(ctx, saved, grad):
+        planes, psfs, spectra, weights, kept, *held = saved
         convolution = ctx.convolution
         need_planes, need_psfs, need_spectra, need_weights = ctx.needs_input_grad[:4]
         factors = None if spectra is None else convolution.transform(planes)

@@ -9,6 +9,7 @@ Pixel maps cannot be sampled like smooth paths; they come as `PixelMap` and pass
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -70,6 +71,12 @@ class Element(nn.Module):
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric
     focuses = True  # whether its vergence counts when the sensor is put in focus; a deliberate defocus must not
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        """Terms of its own are not symmetric until the subclass says so: what it inherits was said of others."""
+        super().__init_subclass__(**arguments)
+        if "terms" in vars(cls) and "symmetric" not in vars(cls):
+            cls.symmetric = False
 
     def vergence(self, wavelengths: Tensor) -> Tensor:
         """Coefficient of r^2 / 2 in the OPD, (L,) float64 [1/m]; a converging lens has -1 / f."""

@@ -105,7 +105,7 @@ class Lens(nn.Module):
     @property
     def even(self) -> bool:
         """Whether no element's path tells x from -x and y from -y, by its type; maps of pixels may."""
-        return all(element.symmetric or type(element).terms is Element.terms for element in self.elements)
+        return all(e.symmetric or getattr(e.terms, "__func__", None) is Element.terms for e in self.elements)
 
     @property
     def round(self) -> bool:

@@ -5,51 +5,75 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcam.optics import sampling
-from kcam.optics.linear import apply_linear
+from kcam.optics.autograd import apply_linear
 from kcam.optics.quadrants import by_x, join, join_adjoint, parities
 
+_FEW = 2**17  # points below which two plain products are faster than their parts by parity
 
-def to_pixels(
-    quadrants: Tensor,
-    shape: tuple[int, int],
-    *,
-    per_pixel: float = 1.0,
-    active: float = 1.0,
-    integrate: bool = True,
-) -> Tensor:
-    """Mean intensity over each pixel, or its value at the centre: (..., H, W).
 
-    Args:
-        quadrants: (..., 4, K + 1, K + 1) of the intensity at `per_pixel` points a pixel, as `split` gives them.
-        shape: (H, W) pixels; the axis goes through the centre of pixel n // 2.
-        active: width of the light-sensitive part of a pixel. integrate: False takes the values at the centres, of one
-        point a pixel.
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels over a square grid of points that reaches K points from the axis to each side.
+
+    shape: (H, W); the axis goes through the centre of pixel n // 2. per_pixel: points in each, on each axis.
+    active: width of the light-sensitive part of a pixel.
+    integrate: the mean over that part; False: the value at the centre, of one point a pixel.
     """
-    height, width = (n // 2 + 1 for n in shape)
-    if not integrate:
-        return join(quadrants[..., :height, :width], odd=True)[..., : shape[0], : shape[1]]
-    reach = quadrants.shape[-1] - 1
-    rows, columns = (
-        _halves(n, per_pixel=per_pixel, reach=reach, active=active, dtype=quadrants.dtype, device=quadrants.device)
-        for n in shape
-    )
-    pixels = apply_linear(quadrants.flatten(0, -4), _PixelSums(rows, columns, shape))
-    return pixels.unflatten(0, quadrants.shape[:-3])
+
+    shape: tuple[int, int]
+    per_pixel: float = 1.0
+    active: float = 1.0
+    integrate: bool = True
+
+    def of_image(self, image: Tensor) -> Tensor:
+        """(..., H, W) of the intensity (..., 2K + 1, 2K + 1)."""
+        reach = image.shape[-1] // 2
+        if self.integrate:
+            rows, columns = (_box(n, **self._how(reach, image)) for n in self.shape)
+            return rows @ image @ columns.mT
+        top, left = (reach - n // 2 for n in self.shape)
+        return image[..., top : top + self.shape[0], left : left + self.shape[1]]
+
+    def of_quadrant(self, quadrant: Tensor) -> Tensor:
+        """(..., H, W) of an intensity that is even in x and y, given for x, y >= 0: (..., K + 1, K + 1)."""
+        own = [abs(i - n // 2) for n in self.shape for i in range(n)]  # which pixel of the quadrant each one repeats
+        if self.integrate:
+            rows, columns = (2 * _halves(n, **self._how(quadrant.shape[-1] - 1, quadrant))[0] for n in self.shape)
+            quadrant = rows @ quadrant @ columns.mT
+        height = self.shape[0]
+        return quadrant[..., own[:height], :][..., own[height:]]
+
+    def of_quadrants(self, quadrants: Tensor) -> Tensor:
+        """(..., H, W) of the intensity as `split` gives it, (..., 4, K + 1, K + 1)."""
+        if not self.integrate or quadrants.numel() < _FEW:
+            return self.of_image(join(quadrants, odd=True))
+        rows, columns = (_halves(n, **self._how(quadrants.shape[-1] - 1, quadrants)) for n in self.shape)
+        pixels = apply_linear(quadrants.flatten(0, -4), _PixelSums(rows, columns, self.shape))
+        return pixels.unflatten(0, quadrants.shape[:-3])
+
+    def _how(self, reach: int, like: Tensor) -> dict[str, Any]:
+        how = {"per_pixel": self.per_pixel, "reach": reach, "active": self.active}
+        return how | {"dtype": like.dtype, "device": like.device}
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _halves(
-    pixels: int, *, per_pixel: float, reach: int, active: float, dtype: torch.dtype, device: torch.device
-) -> Tensor:
+def _box(pixels: int, *, dtype: torch.dtype, device: torch.device, **grid: Any) -> Tensor:
+    return sampling.pixel_box(pixels, **grid).to(device, dtype)
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _halves(pixels: int, *, dtype: torch.dtype, device: torch.device, **grid: Any) -> Tensor:
     """Even and odd part of `pixel_box` for pixels and points from the axis on, (2, pixels // 2 + 1, reach + 1)."""
-    half = pixels // 2
-    box = sampling.pixel_box(2 * half + 1, per_pixel=per_pixel, reach=reach, active=active)[half:]
+    half, reach = pixels // 2, grid["reach"]
+    box = sampling.pixel_box(2 * half + 1, **grid)[half:]
     right, left = box[:, reach:].clone(), box[:, : reach + 1].flip(1)
     right[:, 0] = left[:, 0] = right[:, 0] / 2  # the point on the axis is in both halves
     return torch.stack([right + left, right - left]).div_(2).to(device, dtype)

@@ -17,7 +17,6 @@ from torch.utils.checkpoint import checkpoint
 
 from kcam.optics.psf import Query, residual_path
 from kcam.optics.pupil import Pupil, from_image_side
-from kcam.optics.quadrants import split
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
 _PANEL = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
@@ -132,8 +131,7 @@ def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: fl
     for tap, weight in enumerate(_lagrange(offset)):
         value = value + weight * transformed[..., torch.abs(low + tap)]  # U is even in t
     intensity = value.square().sum(0).to(query.dtype)  # (Z, radii)
-    quadrant = intensity[:, inverse].view(-1, 1, reach + 1, reach + 1)
-    return query.to_pixels(quadrant.expand(-1, 4, -1, -1), per_pixel=per_pixel)
+    return query.pixels(per_pixel).of_quadrant(intensity[:, inverse].view(-1, reach + 1, reach + 1))
 
 
 @functools.lru_cache(maxsize=8)
@@ -185,7 +183,7 @@ def polar_psf(query: Query, *, density: float = 1.0) -> Tensor:
         points = points * (query.pixel_pitch / per_pixel) * scale
         image = _direct_intensity(field, points, xi, eta)
         factor = (a * query.pixel_pitch / (wavelengths[index] * d)) ** 2 / energy
-        bands.append(query.to_pixels(split(image), per_pixel=per_pixel) * factor[:, None, None])
+        bands.append(query.pixels(per_pixel).of_image(image) * factor[:, None, None])
     return torch.stack(bands, dim=1)
 
 

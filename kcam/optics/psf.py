@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from kcam.optics import sampling
-from kcam.optics.linear import LinearMap
-from kcam.optics.pixels import to_pixels
+from kcam.optics.autograd import LinearMap, once_differentiable
+from kcam.optics.pixels import Pixels
 from kcam.optics.pupil import (
     EDGE_MARGIN,
     MapWeights,
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
     from kcam.optics.lens import Lens
 
 _GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
-_MOST_NODES = 16  # of the quadrature of the energy that passes pixel maps
 _MOST_CELLS = 3072  # on which several maps are brought together exactly, beyond by the nearest pixel; and the rim
 
 
@@ -160,9 +159,9 @@ class Query:
             raise TypeError(f"{type(self.lens.aperture).__name__} has neither discs() nor a pixel_map().")
         return pixels.values
 
-    def to_pixels(self, quadrants: Tensor, *, per_pixel: float) -> Tensor:
-        """The intensity on the pixels, (..., H, W); see `pixels.to_pixels`."""
-        return to_pixels(quadrants, self.shape, per_pixel=per_pixel, active=self.active, integrate=self.integrate)
+    def pixels(self, per_pixel: float) -> Pixels:
+        """The pixels that are asked for, over so many points each."""
+        return Pixels(self.shape, per_pixel, active=self.active, integrate=self.integrate)
 
     def pupil(self, x: Tensor, y: Tensor) -> Pupil:
         """The pupil at true normalised coordinates."""
@@ -351,12 +350,13 @@ def _grid_group(
         scales=scales.to(query.dtype),
         transforms=kernels,
         nodes=nodes,
-        step=step,
+        points=torch.arange(-reach, reach + 1) * step,
         tau=query.tau if curved else None,
     )
     # |sum w P|^2 -> share of the energy per pixel: (a^2 h^2)^2 p^2 / (lambda d)^2 / E
     factor = (cell_area * query.pixel_pitch / (wavelengths * query.sensor_distance)[:, None]) ** 2 / energy
-    return query.to_pixels(intensity, per_pixel=per_pixel) * factor[..., None, None].to(query.dtype)
+    image = kernels[0].to_pixels(intensity, query.pixels(per_pixel))
+    return image * factor[..., None, None].to(query.dtype)
 
 
 def _curve(
@@ -442,16 +442,19 @@ class _Cells:
     def energy(self, semi_aperture: Tensor, vergences: Tensor) -> Tensor:
         """INT power / (1 + V^2 r^2) d^2 u of spherical waves, (Z,) [m^2].
 
-        1 / (1 + s) = INT exp(-t) exp(-s t) dt by n nodes of Gauss and Laguerre, whose terms are products over x and y.
-        The error is (s / (2 + s))^2n: 1e-10, or with the most nodes 2e-6 for a source as near as 0.7 semi-apertures.
+        1 / (1 + s) = INT exp(-t) exp(-s t) dt by n nodes of Gauss and Laguerre, whose terms are products over x and y,
+        to (s / (2 + s))^2n = 1e-10; sources nearer than a semi-aperture or so are summed cell by cell.
         """
-        largest = 2 * float((vergences.detach() * semi_aperture.detach()).abs().max()) ** 2
-        ratio = max(largest / (2 + largest), 1e-12)
-        nodes = math.ceil(math.log(1e-10) / (2 * math.log(ratio))) if ratio < 0.4 else _MOST_NODES
-        times, weights = (torch.as_tensor(v).to(vergences) for v in np.polynomial.laguerre.laggauss(nodes))
         count = self.power.shape[-1]
         pitch = 2 * self.half_width / count * semi_aperture
-        centres = (torch.arange(count, device=vergences.device) + 0.5 - count / 2) * pitch
+        centres = (torch.arange(count, dtype=torch.float64, device=vergences.device) + 0.5 - count / 2) * pitch
+        steepest = 2 * float((vergences.detach() * semi_aperture.detach()).abs().max()) ** 2
+        ratio = steepest / (2 + steepest)
+        if not ratio < 0.4:  # or NaN, which stays NaN
+            r2 = centres[:, None] ** 2 + centres**2
+            return pitch**2 * torch.stack([(self.power / (1 + v**2 * r2)).sum() for v in vergences])
+        nodes = math.ceil(math.log(1e-10) / (2 * math.log(max(ratio, 1e-12))))
+        times, weights = (torch.as_tensor(v).to(vergences) for v in np.polynomial.laguerre.laggauss(nodes))
         profile = torch.exp(-times[:, None] * (vergences[:, None, None] * centres) ** 2)
         rows = (profile.to(self.power) @ self.power).to(profile)
         return pitch**2 * ((rows * profile).sum(-1) @ weights)
@@ -594,9 +597,9 @@ class _PixelField(torch.autograd.Function):
         return torch.stack(grids[::2] + grids[1::2]).unflatten(0, (2, -1))
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        phases, factors, amplitude = ctx.saved_tensors
+    @once_differentiable
+    def backward(ctx, saved, grad):
+        phases, factors, amplitude = saved
         d_phases = torch.zeros_like(phases)
         d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
         for index, factor in enumerate(factors.T):

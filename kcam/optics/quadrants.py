@@ -20,18 +20,6 @@ def split(grid: Tensor) -> Tensor:
     return torch.stack([high[..., right], high[..., left].flip(-1), low[..., right], low[..., left].flip(-1)], dim=-3)
 
 
-def split_adjoint(quadrants: Tensor) -> Tensor:
-    """Transpose of `split` of a grid of odd numbers: what belongs to several quadrants is their sum."""
-    h, w = quadrants.shape[-2:]
-    grid = quadrants.new_zeros(*quadrants.shape[:-3], 2 * h - 1, 2 * w - 1)
-    pp, pm, mp, mm = quadrants.unbind(-3)
-    grid[..., h - 1 :, w - 1 :] += pp
-    grid[..., h - 1 :, :w] += pm.flip(-1)
-    grid[..., :h, w - 1 :] += mp.flip(-2)
-    grid[..., :h, :w] += mm.flip(-2, -1)
-    return grid
-
-
 def join(quadrants: Tensor, *, odd: bool) -> Tensor:
     """The grid of quadrants (..., 4, h, w): the inverse of `split`; the axis is taken from the positive side."""
     pp, pm, mp, mm = quadrants.unbind(-3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 
 import numpy as np
@@ -67,8 +66,6 @@ def points_per_pixel(*, pixel_pitch: float, semi_aperture: float, sensor_distanc
     return max(1.0, math.ceil(4 * pixel_pitch / (_NYQUIST_SHARE * nyquist)) / 4)
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)
 def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0) -> Tensor:
     """Integral over each pixel of what is known at a grid of points: row m is the integral of sinc(q x - k) over pixel
     m.

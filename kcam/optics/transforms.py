@@ -18,7 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.quadrants import by_x, join, parities, split, split_adjoint, unfold
+from kcam.optics.autograd import once_differentiable
+from kcam.optics.pixels import Pixels
+from kcam.optics.quadrants import by_x, join, parities, split, unfold
 from kcam.precision import full_precision
 
 Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
@@ -59,11 +61,8 @@ class Transform(Protocol):
     def arrange_points(self, image: Tensor) -> Tensor:
         """An image (2K+1, 2K+1) of values at the points, in the layout of the field."""
 
-    def quadrants(self, values: Tensor) -> Tensor:
-        """Values in the layout of the field as `split` gives an image, (..., 4, K+1, K+1)."""
-
-    def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
-        """Transpose of `quadrants`."""
+    def to_pixels(self, intensity: Tensor, pixels: Pixels) -> Tensor:
+        """An intensity in the layout of the field on pixels."""
 
 
 @dataclass(frozen=True)
@@ -129,10 +128,8 @@ class MatrixTransform:
     def arrange_points(self, image: Tensor) -> Tensor:
         return split(image)
 
-    def quadrants(self, values: Tensor) -> Tensor:
-        return values
-
-    quadrants_adjoint = quadrants
+    def to_pixels(self, intensity: Tensor, pixels: Pixels) -> Tensor:
+        return pixels.of_quadrants(intensity)
 
 
 def _join_parts(parts: Sequence[Tensor], out: Sequence[Tensor]) -> None:
@@ -169,11 +166,8 @@ class _PlainLayout:
     def arrange_even(self, quadrant: Tensor) -> Tensor:
         return unfold(quadrant)
 
-    def quadrants(self, values: Tensor) -> Tensor:
-        return split(values)
-
-    def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
-        return split_adjoint(quadrants)
+    def to_pixels(self, intensity: Tensor, pixels: Pixels) -> Tensor:
+        return pixels.of_image(intensity)
 
 
 @dataclass(frozen=True)
@@ -359,11 +353,8 @@ class CurvedTransform:
     def arrange_points(self, image: Tensor) -> Tensor:
         return self.inner.arrange_points(image)
 
-    def quadrants(self, values: Tensor) -> Tensor:
-        return self.inner.quadrants(values)
-
-    def quadrants_adjoint(self, quadrants: Tensor) -> Tensor:
-        return self.inner.quadrants_adjoint(quadrants)
+    def to_pixels(self, intensity: Tensor, pixels: Pixels) -> Tensor:
+        return self.inner.to_pixels(intensity, pixels)
 
 
 def _times_power_of_i(values: Pair, power: int) -> Pair:
@@ -378,46 +369,45 @@ class _PupilIntensity(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, coefficients, maps, amplitude, field, scales, tau, transforms, nodes, step):
-        quadrants, kept = [], []
+    def forward(ctx, coefficients, maps, amplitude, field, scales, tau, transforms, nodes, points):
+        intensities, kept = [], []
         for group, transform in enumerate(transforms):
-            pupil = _pupil(coefficients[group], maps, amplitude, None if field is None else field[:, group])
+            cosine, sine = _phasor(coefficients[group], maps)
+            pupil = _product((cosine * amplitude, sine * amplitude), None if field is None else field[:, group])
             re, im = transform.forward(pupil)
-            # never abs()**2: its gradient is NaN at 0
-            quadrants.append(transform.quadrants(re.square().addcmul_(im, im)))
+            intensities.append(re.square().addcmul_(im, im))  # never abs()**2: its gradient is NaN at 0
             kept += [re, im]
-        ctx.transforms, ctx.nodes, ctx.step = transforms, nodes, step
+        ctx.transforms, ctx.nodes, ctx.points = transforms, nodes, points
         ctx.save_for_backward(coefficients, maps, amplitude, field, scales, tau, *kept)
-        return torch.stack(quadrants)
+        return torch.stack(intensities)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        coefficients, maps, amplitude, field, scales, tau, *kept = ctx.saved_tensors
+    @once_differentiable
+    def backward(ctx, saved, grad):
+        coefficients, maps, amplitude, field, scales, tau, *kept = saved
         need_coefficients, need_maps, need_amplitude, need_field, need_scales, need_tau = ctx.needs_input_grad[:6]
         d_coefficients = torch.empty_like(coefficients)
-        d_maps = torch.zeros_like(maps)
-        d_amplitude = torch.zeros_like(amplitude)
+        d_maps = torch.zeros_like(maps) if need_maps else None
+        d_amplitude = torch.zeros_like(amplitude) if need_amplitude else None
         d_field = torch.empty_like(field) if need_field else None
         d_scales = torch.empty_like(scales)
         d_tau = torch.zeros_like(tau)
         q2 = 1 + tau * (ctx.nodes[:, None] ** 2 + ctx.nodes**2).to(tau)
-        reach = grad.shape[-1] - 1
-        points = torch.arange(-reach, reach + 1, device=grad.device) * ctx.step
         with full_precision(grad.device):
             for group, transform in enumerate(ctx.transforms):
                 re, im = kept[2 * group], kept[2 * group + 1]
-                weight = 2 * transform.quadrants_adjoint(grad[group])
+                weight = 2 * grad[group]
                 d_u = (weight * re, weight * im)
                 d_pupil = transform.adjoint(d_u)
                 own = None if field is None else field[:, group]
-                phasor = _pupil(coefficients[group], maps, None, None)
+                phasor = _phasor(coefficients[group], maps)
                 if need_amplitude:
                     onto = _turned_back(d_pupil, phasor)
                     into = onto[0] if own is None else onto[0] * own[0] + onto[1] * own[1]
                     d_amplitude += into.sum_to_size(d_amplitude.shape)
+                weighted = (phasor[0] * amplitude, phasor[1] * amplitude)
                 if need_field or need_coefficients or need_maps:
-                    onto = _turned_back(d_pupil, (phasor[0] * amplitude, phasor[1] * amplitude))
+                    onto = _turned_back(d_pupil, weighted)
                     if need_field:
                         for part, values in zip(d_field[:, group], onto, strict=True):
                             torch.sum(values, dim=0, out=part)
@@ -428,27 +418,28 @@ class _PupilIntensity(torch.autograd.Function):
                         if need_maps:
                             d_maps += (coefficients[group].T @ flat).view_as(d_maps)
                 if need_scales or need_tau:
-                    pupil = _pupil(coefficients[group], maps, amplitude, own)
+                    pupil = _product(weighted, own)
                 if need_scales:  # the kernel's exponent is -i s (x xi + y eta) / q
-                    d_scales[group] = _kernel_gradient(transform, pupil, d_u, ctx.nodes, points, q2.rsqrt())
+                    d_scales[group] = _kernel_gradient(transform, pupil, d_u, ctx.nodes, ctx.points, q2.rsqrt())
                 if need_tau:  # d(1 / q) / d tau = (1 - q^2) / (2 tau q^3)
                     slope = -(ctx.nodes[:, None] ** 2 + ctx.nodes**2).to(tau) / (2 * q2**1.5)
-                    d_tau += scales[group] * _kernel_gradient(transform, pupil, d_u, ctx.nodes, points, slope)
+                    d_tau += scales[group] * _kernel_gradient(transform, pupil, d_u, ctx.nodes, ctx.points, slope)
         found = (d_coefficients, d_maps, d_amplitude, d_field, d_scales, d_tau)
         needed = (d if need else None for d, need in zip(found, ctx.needs_input_grad, strict=False))
         return *needed, None, None, None
 
 
-def _pupil(coefficients: Tensor, maps: Tensor, amplitude: Tensor | None, field: Tensor | None) -> Pair:
-    """Real and imaginary part of amplitude * field * exp(i coefficients @ maps) for the distances of one group."""
-    phase = (coefficients @ maps.flatten(1)).view(coefficients.shape[0], *maps.shape[1:])
-    re, im = sines(phase)
-    if amplitude is not None:
-        re = re * amplitude
-        im = im * amplitude
+def _phasor(coefficients: Tensor, maps: Tensor) -> Pair:
+    """Real and imaginary part of exp(i coefficients @ maps) for the distances of one group."""
+    return sines((coefficients @ maps.flatten(1)).view(coefficients.shape[0], *maps.shape[1:]))
+
+
+def _product(pupil: Pair, field: Tensor | None) -> Pair:
+    """Pupil times field."""
     if field is None:
-        return re, im
-    return re * field[0] - im * field[1], re * field[1] + im * field[0]
+        return pupil
+    (re, im), (own_re, own_im) = pupil, field
+    return re * own_re - im * own_im, re * own_im + im * own_re
 
 
 def _turned_back(values: Pair, phasor: Pair) -> Pair:
@@ -493,7 +484,7 @@ def pupil_intensity(
     scales: Tensor,
     transforms: Sequence[Transform],
     nodes: Tensor,
-    step: float,
+    points: Tensor,
     tau: Tensor | None = None,
 ) -> Tensor:
     """Intensity of the transformed pupils amplitude * field * exp(i coefficients @ maps).
@@ -505,10 +496,10 @@ def pupil_intensity(
         field: real and imaginary part of what does not fit into a phase (a low-passed pixel map), (2, G, ...) in the
             transforms' layout, or None.
         scales: (G,) kernel scales s [1/m], for their gradient. transforms: one for each group, built with that scale.
-        nodes: (N,) normalised nodes; step: distance of the points [m].
+        nodes: (N,) normalised nodes; points: (2K + 1,) their positions on each axis [m].
         tau: 0-d, the curvature that `CurvedTransform`s were built with, for its gradient; None: straight kernels.
     Returns:
-        Quadrants of the intensity (G, Z, 4, K + 1, K + 1), as `split` has them; differentiable once in all tensors.
+        (G, Z, ...) in the transforms' layout, for `to_pixels`; differentiable once in all tensors.
     """
     layout = transforms[0]
     maps, amplitude = (
@@ -516,4 +507,4 @@ def pupil_intensity(
     )
     with full_precision(coefficients.device):
         curvature = torch.zeros_like(scales[0]) if tau is None else tau.to(scales)
-        return _PupilIntensity.apply(coefficients, maps, amplitude, field, scales, curvature, transforms, nodes, step)
+        return _PupilIntensity.apply(coefficients, maps, amplitude, field, scales, curvature, transforms, nodes, points)

@@ -1,0 +1,81 @@
+"""Derivatives by hand: linear maps that bring their transpose, and Functions that can be differentiated once."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from kcam.precision import full_precision
+
+
+class LinearMap(Protocol):
+    """A linear map with its transpose."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        """The map."""
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Its transpose."""
+
+
+class _Apply(torch.autograd.Function):
+    @staticmethod
+    def forward(values, linear, transposed):
+        with full_precision(values.device):
+            return linear.adjoint(values) if transposed else linear.forward(values)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        _, ctx.linear, ctx.transposed = inputs
+
+    @staticmethod
+    def backward(ctx, grad):
+        return _Apply.apply(grad, ctx.linear, not ctx.transposed), None, None
+
+    @staticmethod
+    def jvp(ctx, tangent, *_):
+        return _Apply.apply(tangent, ctx.linear, ctx.transposed)
+
+
+def apply_linear(values: Tensor, linear: LinearMap) -> Tensor:
+    """linear.forward(values), differentiable any number of times by the map's own transpose."""
+    return _Apply.apply(values, linear, False)
+
+
+def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """For `backward(ctx, saved, *grads)` of a Function: a second derivative through it is a RuntimeError.
+
+    torch's decorator of this name raises only where the incoming gradient has a graph. Where it has none, as for a loss
+    that is linear in the result, the second derivative would come out as 0.
+    """
+
+    @functools.wraps(backward)
+    def once(ctx: Any, *grads: Tensor) -> Any:
+        saved = ctx.saved_tensors  # once: a checkpoint gives them out only once
+        with torch.no_grad():
+            found = backward(ctx, saved, *grads)
+        if not torch.is_grad_enabled():
+            return found
+        sources = [t for t in (*saved, *grads) if t is not None and t.requires_grad]
+        return tuple(None if d is None else _Refuse.apply(d, *sources) for d in found)
+
+    return once
+
+
+class _Refuse(torch.autograd.Function):
+    """The identity in its first argument; its derivative to any of them is refused."""
+
+    @staticmethod
+    def forward(ctx, value, *sources):
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx, grad):
+        raise RuntimeError(
+            "this stage has first derivatives only. Take second ones by differences of the first, or for a "
+            "symmetric lens alone with method='radial'."
+        )
