@@ -13,7 +13,7 @@ from kcam.precision import full_precision
 
 
 class LinearMap(Protocol):
-    """A linear map with its transpose."""
+    """A linear map with its transpose; for `apply_linear` under vmap, of any leading dimensions."""
 
     def forward(self, values: Tensor) -> Tensor:
         """The map."""
@@ -39,6 +39,10 @@ class _Apply(torch.autograd.Function):
     @staticmethod
     def jvp(ctx, tangent, *_):
         return _Apply.apply(tangent, ctx.linear, ctx.transposed)
+
+    @staticmethod
+    def vmap(info, in_dims, values, linear, transposed):
+        return _Apply.apply(values.movedim(in_dims[0], 0), linear, transposed), 0
 
 
 def apply_linear(values: Tensor, linear: LinearMap) -> Tensor:

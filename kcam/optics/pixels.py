@@ -35,8 +35,7 @@ class Pixels:
         """(..., H, W) of the intensity (..., 2K + 1, 2K + 1)."""
         reach = image.shape[-1] // 2
         if self.integrate:
-            rows, columns = (_box(n, **self._how(reach, image)) for n in self.shape)
-            return rows @ image @ columns.mT
+            return apply_linear(image, _Products(*(_box(n, **self._how(reach, image)) for n in self.shape)))
         top, left = (reach - n // 2 for n in self.shape)
         return image[..., top : top + self.shape[0], left : left + self.shape[1]]
 
@@ -44,8 +43,8 @@ class Pixels:
         """(..., H, W) of an intensity that is even in x and y, given for x, y >= 0: (..., K + 1, K + 1)."""
         own = [abs(i - n // 2) for n in self.shape for i in range(n)]  # which pixel of the quadrant each one repeats
         if self.integrate:
-            rows, columns = (2 * _halves(n, **self._how(quadrant.shape[-1] - 1, quadrant))[0] for n in self.shape)
-            quadrant = rows @ quadrant @ columns.mT
+            even = (2 * _halves(n, **self._how(quadrant.shape[-1] - 1, quadrant))[0] for n in self.shape)
+            quadrant = apply_linear(quadrant, _Products(*even))
         height = self.shape[0]
         return quadrant[..., own[:height], :][..., own[height:]]
 
@@ -54,8 +53,7 @@ class Pixels:
         if not self.integrate or quadrants.numel() < _FEW:
             return self.of_image(join(quadrants, odd=True))
         rows, columns = (_halves(n, **self._how(quadrants.shape[-1] - 1, quadrants)) for n in self.shape)
-        pixels = apply_linear(quadrants.flatten(0, -4), _PixelSums(rows, columns, self.shape))
-        return pixels.unflatten(0, quadrants.shape[:-3])
+        return apply_linear(quadrants, _Parities(rows, columns, self.shape))
 
     def _how(self, reach: int, like: Tensor) -> dict[str, Any]:
         how = {"per_pixel": self.per_pixel, "reach": reach, "active": self.active}
@@ -80,8 +78,24 @@ def _halves(pixels: int, *, dtype: torch.dtype, device: torch.device, **grid: An
 
 
 @dataclass(frozen=True)
-class _PixelSums:
-    """Quadrants (B, 4, K + 1, K + 1) -> pixels (B, H, W); with even and odd parts apart, half the operations.
+class _Products:
+    """Points (..., M, M) -> pixels (..., H, W) by a matrix for each axis."""
+
+    rows: Tensor
+    columns: Tensor
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Sums over the points of each pixel."""
+        return self.rows @ points @ self.columns.mT
+
+    def adjoint(self, pixels: Tensor) -> Tensor:
+        """Transpose of `forward`."""
+        return self.rows.mT @ pixels @ self.columns
+
+
+@dataclass(frozen=True)
+class _Parities:
+    """Quadrants (..., 4, K + 1, K + 1) -> pixels (..., H, W); with even and odd parts apart, half the operations.
 
     rows, columns: `_halves` of both axes.
     """
@@ -102,11 +116,13 @@ class _PixelSums:
         return self._along_both(join_adjoint(whole), self.rows.mT, self.columns.mT)
 
     def _along_both(self, quadrants: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        count, _, length, width = quadrants.shape
+        batch, (length, width) = quadrants.shape[:-3], quadrants.shape[-2:]
+        quadrants = quadrants.reshape(-1, 4, length, width)
+        count = quadrants.shape[0]
         folded = quadrants.new_empty(2, 2, count, length, width)  # parity in x, parity in y
         parities(by_x(quadrants), out=folded.flatten(0, 1).unbind())
         along_x = torch.bmm(folded.view(2, -1, width), columns.mT).view(*folded.shape[:-1], columns.shape[-2])
         sums = [rows[y] @ along_x[x, y] for x, y in itertools.product(range(2), range(2))]
         result = quadrants.new_empty(count, 4, *sums[0].shape[1:])
         parities(sums, out=by_x(result))
-        return result
+        return result.view(*batch, *result.shape[1:])

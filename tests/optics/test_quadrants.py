@@ -10,7 +10,7 @@ from torch import nn
 
 from kcam import optics
 from kcam.optics import PROPAGATORS, pixels, psf, sampling
-from kcam.optics.pixels import Pixels, _PixelSums
+from kcam.optics.pixels import Pixels, _Parities
 from kcam.optics.quadrants import by_x, join, join_adjoint, parities, split, unfold
 from kcam.optics.transforms import MatrixTransform
 from kcam.units import mm, nm, um
@@ -123,7 +123,7 @@ def test_pixels_have_first_and_second_derivatives(generator: torch.Generator, mo
 
 def test_sums_of_pixels_and_their_transpose(generator: torch.Generator) -> None:
     rows, columns = (torch.randn(2, n, 6, generator=generator, dtype=DOUBLE) for n in (4, 3))
-    sums = _PixelSums(rows, columns, (6, 5))
+    sums = _Parities(rows, columns, (6, 5))
     quadrants = torch.randn(2, 4, 6, 6, generator=generator, dtype=DOUBLE)
     image = torch.randn(2, 6, 5, generator=generator, dtype=DOUBLE)
     assert torch.allclose((sums.forward(quadrants) * image).sum(), (quadrants * sums.adjoint(image)).sum())
@@ -241,23 +241,3 @@ def test_the_energy_that_passes_pixel_maps(vergence: float, monkeypatch: pytest.
         for v, own in zip((other, vergence), found, strict=True):
             truth = (cells.power.double() / (1 + v**2 * (x[:, None] ** 2 + x**2))).sum() * (x[1] - x[0]) ** 2
             torch.testing.assert_close(own, truth, rtol=1e-6, atol=0.0, equal_nan=True)
-
-
-def test_a_second_derivative_through_a_grid_is_refused_and_never_zero() -> None:
-    """A loss that is linear in the PSF: torch's own decorator would give 0."""
-    of = optics.Lens(optics.CircularAperture(1 * mm), optics.ThinLens(20 * mm), focus_distance=2.0)
-
-    def peak(vergence: torch.Tensor, method: str) -> torch.Tensor:
-        near = optics.Lens(*of.elements, optics.Defocus(vergence), sensor_distance=of.sensor_distance)
-        image = near.psf([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(5, 5), method=method, dtype=DOUBLE)
-        return image[0, 0, 2, 2]
-
-    at = torch.tensor(0.3, dtype=DOUBLE)
-    second = torch.autograd.functional.hessian(lambda v: peak(v, "radial"), at)
-    assert abs(float(second)) > 1e-3
-    with pytest.raises(RuntimeError, match="first derivatives only"):
-        torch.autograd.functional.hessian(lambda v: peak(v, "matrix"), at)
-    first = torch.autograd.functional.jacobian(lambda v: peak(v, "matrix"), at, create_graph=True)
-    torch.testing.assert_close(
-        first, torch.autograd.functional.jacobian(lambda v: peak(v, "radial"), at), rtol=1e-4, atol=1e-9
-    )
