@@ -151,7 +151,7 @@ def _aberrated(
             MatrixTransform.build(nodes, scale=float(s), step=step, reach=reach, like=like) for s in scales.detach()
         ],
         nodes=nodes,
-        points=torch.arange(-reach, reach + 1) * step,
+        points=torch.arange(-reach, reach + 1, dtype=torch.float64) * step,
     )
     area = grid_spacing(count) ** 2 / float(weights.sum())
     factor = area * (a * pixel_pitch / (grid.to(device) * d)) ** 2  # (L,)

@@ -350,7 +350,7 @@ def _grid_group(
         scales=scales.to(query.dtype),
         transforms=kernels,
         nodes=nodes,
-        points=torch.arange(-reach, reach + 1) * step,
+        points=torch.arange(-reach, reach + 1, dtype=torch.float64) * step,
         tau=query.tau if curved else None,
     )
     # |sum w P|^2 -> share of the energy per pixel: (a^2 h^2)^2 p^2 / (lambda d)^2 / E

@@ -496,7 +496,7 @@ def pupil_intensity(
         field: real and imaginary part of what does not fit into a phase (a low-passed pixel map), (2, G, ...) in the
             transforms' layout, or None.
         scales: (G,) kernel scales s [1/m], for their gradient. transforms: one for each group, built with that scale.
-        nodes: (N,) normalised nodes; points: (2K + 1,) their positions on each axis [m].
+        nodes: (N,) normalised, in the pupil; points: (2K + 1,) on the sensor [m]; of each axis.
         tau: 0-d, the curvature that `CurvedTransform`s were built with, for its gradient; None: straight kernels.
     Returns:
         (G, Z, ...) in the transforms' layout, for `to_pixels`; differentiable once in all tensors.
