@@ -67,7 +67,11 @@ def float64(value: Scalar) -> Tensor:
 
 
 class Element(nn.Module):
-    """A thin element of a lens. Subclasses override what they do; by default an element does nothing."""
+    """A thin element of a lens. Subclasses override what they do; by default an element does nothing.
+
+    A subclass whose terms are rotationally symmetric says `symmetric = True` beside them: then a Hankel transform may
+    take the place of the grid, and one quadrant that of four.
+    """
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric
     focuses = True  # whether its vergence counts when the sensor is put in focus; a deliberate defocus must not
