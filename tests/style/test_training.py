@@ -405,7 +405,7 @@ def test_two_processes_give_the_curve_of_one(tmp_path: Path) -> None:
     )
     one, two = (torch.load(tmp_path / name / "result.pt", weights_only=True) for name in ("one", "two"))
     assert len(one["history"]) == 30
-    assert torch.allclose(one["history"], two["history"], rtol=1e-4)  # measured: 3e-6
+    assert torch.allclose(one["history"], two["history"], rtol=1e-4)  # measured: 6e-6; training itself moves it by 5e-2
 
 
 def test_a_batch_that_the_processes_cannot_share(monkeypatch) -> None:
