@@ -109,7 +109,9 @@ def test_the_first_code_has_fifteen_lines_and_the_training_twelve() -> None:
     assert code_lines(training[1]) <= 12
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "plan_scenes" else name for name in EXAMPLES]
+)
 def test_example_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     module = load(ROOT / "examples" / f"{name}.py")
     with generate.inside(tmp_path):

@@ -115,7 +115,7 @@ def _kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.nd
     return np.where(np.abs(offset) < half_width, np.sinc(offset) * np.i0(beta * np.sqrt(inside)) / np.i0(beta), 0.0)
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=12)
 @torch.inference_mode(False)
 def disc_coverage(
     discs: tuple[tuple[float, float], ...], cells: int, *, half_width: float, dtype: torch.dtype, device: torch.device

@@ -419,6 +419,7 @@ def test_a_wrong_shard_is_a_usage_error(cubes: Path, tmp_path: Path, shard: str)
     assert "is not i/n" in extract_tool(cubes, tmp_path / "out", f"--shard={shard}", status=2)
 
 
+@pytest.mark.slow
 def test_two_workers_make_the_same_bytes(cubes: Path, store: Path, tmp_path: Path):
     extract_tool(cubes, tmp_path / "out", "--workers", 2)
     assert content(tmp_path / "out") == content(store)
