@@ -10,7 +10,7 @@ import torch
 
 from kcam.style import Settings, fit
 
-# at a tenth of the rates, a ReLU that rounding turns over still makes one run in three another one within 30 steps
+# at a tenth of the rates, a ReLU that rounding turns over still makes one run in two another one within 30 steps
 SLOW = {part: rate / 100 for part, rate in Settings().rates.items()}
 
 
