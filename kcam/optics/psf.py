@@ -542,7 +542,7 @@ def _pixel_field(query: Query, cells: _Cells, layout: Transform, *, count: int, 
 
     def both(tau: float) -> Tensor:
         onto = _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved)
-        return _PixelField.apply(cells.phases, cells.factors, cells.amplitude, _LaidOut(onto, layout))
+        return _PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto, layout)
 
     return _following(query.tau, both, spacing=spacing)
 
@@ -570,30 +570,17 @@ class _Warped:
         return self.weights.adjoint(self.warp.adjoint(grid))
 
 
-@dataclass(frozen=True)
-class _LaidOut:
-    """Cells onto the pupil grid, in the layout of a transform."""
-
-    onto: LinearMap
-    layout: Transform
-
-    def forward(self, field: Tensor) -> Tensor:
-        return self.layout.arrange(self.onto.forward(field))
-
-    def adjoint(self, grid: Tensor) -> Tensor:
-        return self.onto.adjoint(self.layout.disarrange(grid))
-
-
 class _PixelField(torch.autograd.Function):
     """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength, real and imaginary part (2, L, ...);
     no sines are kept for the backward pass.
     """
 
     @staticmethod
-    def forward(ctx, phases, factors, amplitude, onto):
+    def forward(ctx, phases, factors, amplitude, onto, layout):
         ctx.save_for_backward(phases, factors, amplitude)
-        ctx.onto = onto
-        grids = [onto.forward(values.mul_(amplitude)) for factor in factors.T for values in _sines(factor, phases)]
+        ctx.onto, ctx.layout = onto, layout
+        fields = (values.mul_(amplitude) for factor in factors.T for values in _sines(factor, phases))
+        grids = [layout.arrange(onto.forward(field)) for field in fields]
         return torch.stack(grids[::2] + grids[1::2]).unflatten(0, (2, -1))
 
     @staticmethod
@@ -604,14 +591,14 @@ class _PixelField(torch.autograd.Function):
         d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
         for index, factor in enumerate(factors.T):
             with full_precision(grad.device):
-                onto_re, onto_im = (ctx.onto.adjoint(part[index]) for part in grad)
+                onto_re, onto_im = (ctx.onto.adjoint(ctx.layout.disarrange(part[index])) for part in grad)
             cosine, sine = _sines(factor, phases)
             if d_amplitude is not None:
                 d_amplitude.addcmul_(cosine, onto_re).addcmul_(sine, onto_im)
             d_angle = cosine.mul_(onto_im).addcmul_(sine, onto_re, value=-1)
             for d_phase, own in zip(d_phases, factor, strict=True):
                 d_phase.addcmul_(d_angle, own)
-        return d_phases.mul_(amplitude), None, d_amplitude, None
+        return d_phases.mul_(amplitude), None, d_amplitude, None, None
 
 
 def _sines(factor: Tensor, phases: Tensor) -> Pair:
