@@ -119,15 +119,18 @@ def _from_rim(distance: np.ndarray, r: np.ndarray, airy: float) -> np.ndarray:
 def _map_error(query: Query, *, period: float, captured: float) -> float:
     """What maps of flat pixels cost: the rim cuts their pixels in cells of a finite size, and their low-pass droops.
 
-    The first is of all the light, and weighs more where little is captured (a fit). The droop is averaged over a window
-    that the light fills, and weighted by 0.3, for most light falls short of that.
+    The first is of all the light, and weighs more where little is captured (a fit); a map that is the aperture is not
+    cut. The droop is averaged over a window that the light fills, and weighted by 0.3, for most light falls short.
     """
-    if not query.lens.has_pixels:
+    lens = query.lens
+    if not lens.has_pixels:
         return 0.0
+    maps = sum(element.pixel_map(query.wavelengths) is not None for element in lens.elements)
+    cut = 4e-4 / captured ** (1 / 3) if lens.aperture.discs() or maps > 1 else 0.0
     r = (np.arange(_RADII) + 0.5) / _RADII
     frequency = r * query.half_window / period
     droop = np.abs(1 - map_response(frequency) ** 2) + map_response(1 - frequency) ** 2
-    return 9e-4 / captured ** (1 / 3) + 0.3 * float((droop * r).sum() / r.sum())
+    return cut + 0.3 * float((droop * r).sum() / r.sum())
 
 
 def jumps(query: Query) -> float:

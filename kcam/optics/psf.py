@@ -27,14 +27,14 @@ from kcam.optics.pupil import (
     EDGE_MARGIN,
     MapWeights,
     Pupil,
-    disc_coverage,
+    disc_cells,
     disc_weights,
     from_image_side,
     grid_nodes,
     grid_spacing,
     map_weights,
     pupil_tau,
-    square_coverage,
+    square_cells,
 )
 from kcam.optics.quadrants import unfold
 from kcam.optics.transforms import (
@@ -427,7 +427,7 @@ class _Cells:
     """All pixel maps of a lens on one grid of square cells over the pupil, and the way from there to the pupil grid.
 
     half_width: of the grid of cells in units of the semi-aperture.
-    amplitude, power: (C, C) what the aperture transmits, the rim by the exact area of each cell.
+    amplitude, power: (C, C) what the aperture transmits; of power, the rim by the exact area of each cell.
     phases: (E, C, C) of the phase maps [rad], their `factors` (E, L).
     weights: from the cells to the pupil grid.
     """
@@ -498,7 +498,9 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
 
     amplitude = power = torch.ones((), dtype=query.dtype, device=query.device).expand(cells, cells)
     if discs:
-        amplitude = power = disc_coverage(discs, cells, half_width=half_width, dtype=query.dtype, device=query.device)
+        amplitude, power = disc_cells(
+            discs, cells, per_pixel=refine, half_width=half_width, dtype=query.dtype, device=query.device
+        )
     phases, factors = [], []
     for pixels, width in zip(maps, widths, strict=True):
         values = look_up(pixels.values, width)
@@ -510,8 +512,8 @@ def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: floa
     if not phases:
         phases, factors = [torch.zeros_like(amplitude)], [torch.ones_like(wavelengths)]
     if not discs and half_width > 1:
-        inside = square_coverage(cells, half_width=half_width).to(amplitude)
-        amplitude, power = amplitude * inside, power * inside
+        rim = square_cells(cells, per_pixel=refine, half_width=half_width)
+        amplitude, power = amplitude * rim[0].to(amplitude), power * rim[1].to(power)
 
     weights = map_weights(
         cells, half_width=half_width, count=count, spacing=spacing, dtype=query.dtype, device=query.device

@@ -12,7 +12,7 @@ edges would be curved there, are sampled in the true plane; `transforms.CurvedTr
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,7 +109,7 @@ def _disc_area_below(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where(x <= rim, x * y, y * rim + under_arc(x) - under_arc(rim))
 
 
-def _kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.ndarray:
+def kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.ndarray:
     """Kaiser-windowed sinc with its zeros at the integers."""
     inside = np.clip(1 - (offset / half_width) ** 2, 0, None)
     return np.where(np.abs(offset) < half_width, np.sinc(offset) * np.i0(beta * np.sqrt(inside)) / np.i0(beta), 0.0)
@@ -117,34 +117,59 @@ def _kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.nd
 
 @functools.lru_cache(maxsize=12)
 @torch.inference_mode(False)
-def disc_coverage(
-    discs: tuple[tuple[float, float], ...], cells: int, *, half_width: float, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """Share of each cell of a square grid that lies inside centred discs (radius, weight), (cells, cells), exact.
+def disc_cells(
+    discs: tuple[tuple[float, float], ...],
+    cells: int,
+    *,
+    per_pixel: int,
+    half_width: float,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> tuple[Tensor, Tensor]:
+    """Centred discs (radius, weight) on a square grid of flat cells: amplitude and power, (cells, cells) each.
+
+    power: the share of each cell that is inside, exact. amplitude: what the cells must hold to diffract as the rim
+    does. A share is the rim averaged over its cell, and a flat cell averages it again: both droop as sinc^2 of the
+    frequency in cycles per cell, which a twelfth of the second differences undoes to the fourth order. Cells of one
+    pixel exchange it, (per_pixel, per_pixel) of them; the next pixel may have any phase.
 
     half_width: of the grid, in the unit of the radii.
     """
-    total = np.zeros((cells, cells))
+    share = np.zeros((cells, cells))
     for radius, weight in discs:
         edges = np.linspace(-half_width, half_width, cells + 1) / radius
         sign = np.sign(edges)
         area = _disc_area_below(np.abs(edges)[:, None], np.abs(edges)[None, :]) * sign[:, None] * sign[None, :]
-        total += weight * (np.diff(np.diff(area, axis=0), axis=1) / (edges[1] - edges[0]) ** 2).clip(0, 1)
-    return torch.as_tensor(total).to(device, dtype)
+        share += weight * (np.diff(np.diff(area, axis=0), axis=1) / (edges[1] - edges[0]) ** 2).clip(0, 1)
+    amplitude = share
+    for _ in range(2):  # along x, then (transposed) along y
+        slope = np.diff(amplitude, prepend=0, append=0)
+        slope[:, ::per_pixel] = 0
+        amplitude = (amplitude - np.diff(slope) / 12).T
+    return torch.as_tensor(amplitude).to(device, dtype).contiguous(), torch.as_tensor(share).to(device, dtype)
 
 
-def square_coverage(cells: int, *, half_width: float) -> Tensor:
-    """Share of each cell of a square grid that lies inside the square [-1, 1]^2, (cells, cells) float64, exact."""
+def square_cells(cells: int, *, per_pixel: int, half_width: float) -> tuple[Tensor, Tensor]:
+    """The square [-1, 1]^2 on a grid of flat cells, as `disc_cells` has discs: amplitude and power, float64.
+
+    Of a cell that an edge cuts, the share s would be (1 - s) / 2 cells too far outside: as much light as makes up for
+    it moves in by a cell, if that is of the same pixel.
+    """
     edges = torch.linspace(-half_width, half_width, cells + 1, dtype=torch.float64).clamp(-1, 1)
     share = edges.diff() * cells / (2 * half_width)
-    return share[:, None] * share
+    moved = share * (1 - share) / 2
+    moved = torch.cat([moved[: cells // 2], -moved[cells // 2 :]])  # > 0: to the next cell, < 0: to the one before
+    to_next, to_previous = moved.clamp(min=0), -moved.clamp(max=0)
+    to_next[per_pixel - 1 :: per_pixel] = to_previous[::per_pixel] = 0
+    along = share - to_next - to_previous + to_next.roll(1) + to_previous.roll(-1)
+    return along[:, None] * along, share[:, None] * share
 
 
 @functools.lru_cache(maxsize=1)
 def _edge_taps() -> np.ndarray:
     """The low-pass of edge weights, a tap for each fine cell; the outer taps undo the droop of the cell average."""
     reach = _EDGE_HALF_WIDTH * FINE
-    taps = _kaiser_sinc(np.arange(-reach, reach + 1) / FINE, half_width=_EDGE_HALF_WIDTH, beta=13.2)
+    taps = kaiser_sinc(np.arange(-reach, reach + 1) / FINE, half_width=_EDGE_HALF_WIDTH, beta=13.2)
     taps = np.convolve(taps, [-1 / 24, 13 / 12, -1 / 24])
     return taps / taps.sum()
 
@@ -207,22 +232,17 @@ def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing
 def _low_pass_integral() -> tuple[np.ndarray, np.ndarray]:
     """Running integral of the map low-pass, tabulated: (offsets in samples, integral from -inf)."""
     offset = np.linspace(-_MAP_HALF_WIDTH, _MAP_HALF_WIDTH, 200 * 2 * _MAP_HALF_WIDTH + 1)
-    kernel = _kaiser_sinc(offset, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
+    kernel = kaiser_sinc(offset, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
     step = offset[1] - offset[0]
     # Simpson-like correction of the trapezium: h^2/12 times the slope at the ends vanishes, the kernel is 0 there
     integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)]) * step
     return offset, integral / integral[-1]
 
 
-def map_kernel() -> tuple[float, Callable[[np.ndarray], np.ndarray]]:
-    """The low-pass of pixel maps: (half width in samples, its values at offsets in samples); 1 at 0."""
-    return _MAP_HALF_WIDTH, functools.partial(_kaiser_sinc, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
-
-
 @functools.lru_cache(maxsize=1)
 def _map_spectrum() -> tuple[np.ndarray, np.ndarray]:
     offset = np.linspace(-_MAP_HALF_WIDTH, _MAP_HALF_WIDTH, 20 * 2 * _MAP_HALF_WIDTH + 1)
-    kernel = _kaiser_sinc(offset, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
+    kernel = kaiser_sinc(offset, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
     frequency = np.linspace(0, 1.5, 601)
     return frequency, (kernel * np.cos(2 * np.pi * frequency[:, None] * offset)).sum(1) / kernel.sum()
 
