@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -13,11 +15,28 @@ def place() -> tuple[int, int]:
     return 0, 1
 
 
-def mean_over_processes(values: Tensor, world: int) -> Tensor:
-    """The same in each of them."""
+def gathered(rows: Tensor, world: int) -> Tensor:
+    """(R,...) of each process to the batch (B,...), the same in all: process k has the rows k, k + world, ..."""
+    if world == 1:
+        return rows
+    parts = [torch.empty_like(rows) for _ in range(world)]
+    torch.distributed.all_gather(parts, rows.contiguous())
+    return torch.stack(parts, dim=1).flatten(0, 1)
+
+
+def of_the_first(values: Tensor, world: int) -> Tensor:
+    """The first process's, in all: what each has computed alike stays alike where a sum's order is not fixed (CUDA)."""
     if world > 1:
-        torch.distributed.all_reduce(values)
-    return values / world
+        values = values.contiguous()
+        torch.distributed.broadcast(values, src=0)
+    return values
+
+
+def start_alike(values: Iterable[Tensor], world: int) -> None:
+    """Parameters and buffers of all processes become the first one's."""
+    for value in values:
+        if world > 1:
+            value.detach().copy_(of_the_first(value.detach().clone(), world))
 
 
 def anywhere(said: bool, world: int) -> bool:

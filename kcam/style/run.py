@@ -18,15 +18,14 @@ from kcam import isp, sensor
 from kcam.camera import Camera
 from kcam.isp.style_stage import LEAST_SHOWN
 from kcam.planner import Plan
-from kcam.scene import Scene
 from kcam.style.checkpoints import Checkpoints
 from kcam.style.draws import torch_generator
 from kcam.style.losses import StyleLoss, luminance
 from kcam.style.optimiser import load_optimiser_state, optimiser_state
-from kcam.style.processes import mean_over_processes, place
+from kcam.style.processes import place, start_alike
 from kcam.style.scenes import Source
 from kcam.style.settings import Settings, trained_parameters
-from kcam.style.step import Step
+from kcam.style.step import gradients
 
 NOISE_STREAM = 2**40  # streams of the camera's noise lie beyond those of the scenes: one for each row and stage
 MOST_STAGES = 2**10
@@ -79,42 +78,38 @@ class Run:
         self.clock = _Clock()
         self.plan: Plan | None = None
         self._snapshot: dict[str, Any] = {}
-        self.module = Step(camera, loss)
-        self.engine: Any = self.module
-        if self.world > 1:
-            others = [p for p in camera.parameters() if not any(p is own for own in self.named.values())]
-            for parameter in others:
-                parameter.requires_grad_(False)  # the engine waits for the gradient of each that has one
-            self.engine = nn.parallel.DistributedDataParallel(self.module)
+        self.through = camera  # a plan puts another one here
+        start_alike([*camera.parameters(), *camera.buffers()], self.world)
         self._white = self._responses()
 
     # ---- one step --------------------------------------------------------------------------------------------------
 
     def take_step(self) -> None:
         settings = self.settings
-        rows = range(self.rank, settings.batch, self.world)
         self.clock.start()
-        scene, origins = self.source.draw(rows, seed=settings.seed, step=self.step)
+        scene, origins = self.source.draw(range(settings.batch), seed=settings.seed, step=self.step)
         device = next(iter(self.named.values())).device
         scene = scene.to(device=device)
         if self.plan is None:
             self._make_plan()
 
-        def generator(number: int, stage: int) -> torch.Generator:
-            stream = NOISE_STREAM + MOST_STAGES * rows[number] + stage
+        def generator(row: int, stage: int) -> torch.Generator:
+            stream = NOISE_STREAM + MOST_STAGES * row + stage
             return torch_generator(settings.seed, self.step, stream=stream, device=device)
 
         self.clock.mark("scenes")
-        terms, picture = self.engine(scene, generator, self.step, self.clock.mark)
-        if "content" in terms:
-            terms["content"] = terms["content"] * self.emphasis
-        total = torch.stack(list(terms.values())).sum()
-        self.optimiser.zero_grad()
-        total.backward()
+        taken = gradients(
+            self.through,
+            self.loss,
+            scene,
+            generator,
+            parameters=list(self.named.values()),
+            turn=self.step,
+            emphasis=self.emphasis,
+            mark=self.clock.mark,
+        )
         norm = nn.utils.clip_grad_norm_(self.named.values(), settings.clip)
-        self.clock.mark("gradient")
-        self.names = ("total", *terms)
-        values = mean_over_processes(torch.stack([total, *terms.values()]).detach().double(), self.world).tolist()
+        self.names, values = tuple(taken.values), list(taken.values.values())
         wrong = self._what_is_wrong(values, float(norm))
         if wrong:
             self._go_back(wrong, origins)
@@ -132,7 +127,7 @@ class Run:
         self._aim()
         self.clock.mark("update")
         if self.step % LOOK == 0 and self.step > SETTLED:
-            self._look(picture.detach(), scene)
+            self._look(taken.pictures, taken.shown)
 
     def _aim(self) -> None:
         """Move the content's weight towards what makes its loss the one that is aimed at."""
@@ -178,10 +173,9 @@ class Run:
         if self.leads:
             warnings.warn(text, StyleWarning, stacklevel=4)
 
-    def _look(self, picture: Tensor, scene: Scene) -> None:
+    def _look(self, picture: Tensor, shown: Tensor) -> None:
         """Warn, once each, of a negative, of clipped pictures, and of a channel that goes blind."""
-        shown = luminance(scene.to_srgb()).flatten(1)
-        pairs = torch.stack([luminance(picture).flatten(1), shown], dim=1)
+        pairs = torch.stack([luminance(picture).flatten(1), luminance(shown).flatten(1)], dim=1)
         alike = float(torch.stack([torch.corrcoef(pair)[0, 1] for pair in pairs]).nan_to_num(1.0).mean())
         end = LEAST_SHOWN + 1e-3 if any(isinstance(s, isp.StyleStage) for s in self.camera) else 1 / 512
         clipped = float(((picture <= end) | (picture >= 1 - end)).float().mean())
@@ -221,7 +215,7 @@ class Run:
     def _use_plan(self, plan: Plan | None) -> None:
         if plan is not None:
             planned = plan.apply(self.camera)  # a plain camera: a planned one would warn of each scene unlike its own
-            self.module.through = Camera(*planned, context=self.camera.context)
+            self.through = Camera(*planned, context=self.camera.context)
 
     # ---- keeping and going on --------------------------------------------------------------------------------------
 

@@ -14,8 +14,8 @@ from kcam.units import mm, nm, um
 SIZE = 64
 
 
-def camera(*, stage: bool = True, photons: bool = True) -> Camera:
-    """All parts that train, each as small as it gets. photons: shot noise and the ADC, which rounding can turn over."""
+def camera(*, stage: bool = True) -> Camera:
+    """All parts that train, each as small as it gets."""
     lens = optics.Lens(
         optics.CircularAperture(diameter=5 * mm),
         optics.ThinLens(focal_length=50 * mm),
@@ -27,7 +27,8 @@ def camera(*, stage: bool = True, photons: bool = True) -> Camera:
         sensor.ColourFilter.kodak(infrared_cut=680 * nm).trainable(),
         sensor.Mosaic("RGGB"),
         sensor.Exposure(),
-        *([sensor.ShotNoise(full_well=10_000), sensor.ADC(bits=12)] if photons else []),
+        sensor.ShotNoise(full_well=10_000),
+        sensor.ADC(bits=12),
         isp.Demosaic("bilinear"),
         isp.Convolution(),
         isp.ToneCurve(),

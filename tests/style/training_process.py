@@ -8,10 +8,7 @@ from pathlib import Path
 import tiny
 import torch
 
-from kcam.style import Settings, fit
-
-# at a tenth of the rates, a ReLU that rounding turns over still makes one run in two another one within 30 steps
-SLOW = {part: rate / 100 for part, rate in Settings().rates.items()}
+from kcam.style import fit
 
 
 def main() -> None:
@@ -22,10 +19,10 @@ def main() -> None:
     if distributed:
         torch.distributed.init_process_group("gloo")
     trained = fit(
-        tiny.camera(photons="--smooth" not in sys.argv),
+        tiny.camera(),
         tiny.loss(),
         source=tiny.source(),
-        settings=tiny.settings(steps=30, every=2, rates=SLOW if "--smooth" in sys.argv else Settings().rates),
+        settings=tiny.settings(steps=30, every=2, batch=4 if "--four" in sys.argv else 2),
         folder=folder / "checkpoints",
         resume="--resume" in sys.argv,
     )
