@@ -20,6 +20,7 @@ from torch import Tensor
 from kcam import __version__, files, isp, plots, report, style
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
+from kcam.style.processes import place, told_by_the_first
 
 fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 
@@ -109,10 +110,10 @@ def run(
     picture = style_picture(options.style, size=options.style_size)
     features = style_features(options.features, options.vgg_weights)
     document: dict[str, Any] = {"options": asdict(options), "style": _hash(picture)}
-    document["threads"] = _threads(folder, resume, threads)
     with ExitStack() as stack:
-        stack.enter_context(_threads_set(document["threads"]))
         leads, device = stack.enter_context(_processes(options.device))
+        document["threads"] = told_by_the_first(_threads(folder, resume, threads), place()[1])
+        stack.enter_context(_threads_set(document["threads"]))
         if leads:  # the others would meet what this one has begun to write
             stack.enter_context(_alone(folder))
             _check_folder(folder, document, resume=resume)
@@ -290,6 +291,8 @@ def _processes(device: str) -> Iterator[tuple[bool, torch.device]]:
         yield True, torch.device(device)
         return
     own = torch.device(device, int(os.environ["LOCAL_RANK"])) if device == "cuda" else torch.device(device)
+    if device == "cuda":
+        torch.cuda.set_device(own)  # else every process's flags and objects would go by the first one
     torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
     try:
         yield torch.distributed.get_rank() == 0, own

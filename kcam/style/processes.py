@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,6 +31,14 @@ def of_the_first(values: Tensor, world: int) -> Tensor:
         values = values.contiguous()
         torch.distributed.broadcast(values, src=0)
     return values
+
+
+def told_by_the_first(value: Any, world: int) -> Any:
+    """The first process's value, in all of them."""
+    told = [value]
+    if world > 1:
+        torch.distributed.broadcast_object_list(told)
+    return told[0]
 
 
 def start_alike(values: Iterable[Tensor], world: int) -> None:

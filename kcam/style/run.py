@@ -22,7 +22,7 @@ from kcam.style.checkpoints import Checkpoints
 from kcam.style.draws import torch_generator
 from kcam.style.losses import StyleLoss, luminance
 from kcam.style.optimiser import load_optimiser_state, optimiser_state
-from kcam.style.processes import place, start_alike
+from kcam.style.processes import place, start_alike, told_by_the_first
 from kcam.style.scenes import Source
 from kcam.style.settings import Settings, trained_parameters
 from kcam.style.step import gradients
@@ -59,6 +59,7 @@ class Run:
             raise ValueError(
                 f"a batch of {settings.batch} cannot be shared by {self.world} processes. Use a multiple of it."
             )
+        start_alike([*camera.parameters(), *camera.buffers()], self.world)
         groups = [
             {
                 "params": [p for _, p in named],
@@ -79,7 +80,6 @@ class Run:
         self.plan: Plan | None = None
         self._snapshot: dict[str, Any] = {}
         self.through = camera  # a plan puts another one here
-        start_alike([*camera.parameters(), *camera.buffers()], self.world)
         self._white = self._responses()
 
     # ---- one step --------------------------------------------------------------------------------------------------
@@ -205,12 +205,14 @@ class Run:
         tolerance = self.settings.tolerance
         if tolerance is None:
             return
-        scenes = [self.source.draw([row], seed=self.settings.seed, step=self.step)[0] for row in range(2)]
-        with torch.no_grad():
-            plan = self.plan
-            if plan is None or max(plan.measure(self.camera, scene) for scene in scenes) > tolerance:
-                self.plan = plan = self.camera.plan(scenes, tolerance=tolerance)
-        self._use_plan(plan)
+        if self.leads:  # what a plan chooses depends on how fast its machine is
+            scenes = [self.source.draw([row], seed=self.settings.seed, step=self.step)[0] for row in range(2)]
+            with torch.no_grad():
+                plan = self.plan
+                if plan is None or max(plan.measure(self.camera, scene) for scene in scenes) > tolerance:
+                    self.plan = self.camera.plan(scenes, tolerance=tolerance)
+        self.plan = told_by_the_first(self.plan, self.world)
+        self._use_plan(self.plan)
 
     def _use_plan(self, plan: Plan | None) -> None:
         if plan is not None:
@@ -276,10 +278,7 @@ class Run:
     def resume(self) -> None:
         found = None if self.checkpoints is None else self.checkpoints.latest()
         state = None if found is None else {"tensors": found.tensors, "document": found.document}
-        if self.world > 1:
-            shared = [state]
-            torch.distributed.broadcast_object_list(shared)
-            state = shared[0]
+        state = told_by_the_first(state, self.world)
         if state is None:
             return
         there, here = state["document"]["run"], self._identity()

@@ -106,8 +106,6 @@ def gradients(
     taken = record(camera, scene, recorded=bool(loss.weights["l2"]))
     light, shown = taken.light, scene.to_srgb()
     mark("camera")
-    behind = {p for stage in taken.stages for p in stage.parameters()}
-    behind_trained = [p for p in parameters if p in behind]
     pictures, values, slopes, rows = [], [], [], range(rank, len(light), world)
     for row in rows:
         signal = light[row : row + 1].detach().requires_grad_(light.requires_grad)
@@ -120,35 +118,40 @@ def gradients(
         total = torch.stack(list(terms.values())).sum()
         values.append(torch.stack([total, *terms.values()]).detach().double())
         mark("loss")
-        slopes.append(_slopes(total / len(light), [signal, *behind_trained]))
+        slopes.append(_slopes(total / len(light), [signal, *parameters]))
         mark("gradient")
     found = gathered(torch.stack(values), world).mean(0).tolist()
-    all_slopes = gathered(torch.stack(slopes), world)
-    onto_light, of_parameters = all_slopes.split([light[0].numel(), all_slopes.shape[1] - light[0].numel()], dim=1)
-    trained = _unflatten(of_parameters.sum(0), behind_trained)
-    for parameter in parameters:
-        parameter.grad = trained.get(parameter)
-    if light.requires_grad:
-        before = [p for p in parameters if p.requires_grad]
-        through = torch.autograd.grad(light, before, onto_light.view_as(light), allow_unused=True)
-        for parameter, slope in zip(before, through, strict=True):
+    depends = torch.tensor([[slope is not None for slope in row] for row in slopes], device=light.device)
+    reached = gathered(depends, world).any(0).tolist()
+    members = [(index, value) for index, value in enumerate([light[:1], *parameters]) if reached[index]]
+    summed: dict[int, Tensor] = {}
+    if members:
+        flat = gathered(torch.stack([_flat(row, members) for row in slopes]), world)
+        for (index, value), part in zip(members, flat.split([v.numel() for _, v in members], dim=1), strict=True):
+            summed[index] = (part if index == 0 else part.sum(0)).to(value.dtype)
+    for index, parameter in enumerate(parameters, start=1):
+        parameter.grad = summed[index].view_as(parameter) if index in summed else None
+    if 0 in summed:
+        through = torch.autograd.grad(light, parameters, summed[0].view_as(light), allow_unused=True)
+        for parameter, slope in zip(parameters, through, strict=True):
             if slope is not None:
-                slope = of_the_first(slope, world)
-                parameter.grad = slope if parameter.grad is None else parameter.grad + slope
+                own = of_the_first(slope, world)
+                parameter.grad = own if parameter.grad is None else parameter.grad + own
     mark("gradient")
     names = ("total", *terms)
     return Taken(dict(zip(names, found, strict=True)), torch.cat(pictures).detach(), shown[list(rows)])
 
 
-def _slopes(total: Tensor, of: Sequence[Tensor]) -> Tensor:
-    """The gradient of a number, in one row; 0 for what it does not depend on."""
+def _slopes(total: Tensor, of: Sequence[Tensor]) -> list[Tensor | None]:
+    """The gradient of a number; None for what it does not depend on."""
     asked = [value for value in of if value.requires_grad]
     found = iter(torch.autograd.grad(total, asked, allow_unused=True) if total.requires_grad else [None] * len(asked))
-    slopes = [next(found) if value.requires_grad else None for value in of]
-    flat = [torch.zeros_like(v) if slope is None else slope for v, slope in zip(of, slopes, strict=True)]
-    return torch.cat([slope.flatten() for slope in flat])
+    return [next(found) if value.requires_grad else None for value in of]
 
 
-def _unflatten(flat: Tensor, parameters: Sequence[nn.Parameter]) -> dict[nn.Parameter, Tensor]:
-    parts = flat.split([p.numel() for p in parameters])
-    return {p: part.view_as(p) for p, part in zip(parameters, parts, strict=True)}
+def _flat(slopes: Sequence[Tensor | None], members: Sequence[tuple[int, Tensor]]) -> Tensor:
+    """Those of the members in one row; 0 for what this row of the batch does not depend on."""
+    parts = [slopes[index] for index, _ in members]
+    return torch.cat(
+        [(torch.zeros_like(v) if part is None else part).flatten() for part, (_, v) in zip(parts, members, strict=True)]
+    )

@@ -18,16 +18,25 @@ def main() -> None:
     distributed = torch.distributed.is_torchelastic_launched()
     if distributed:
         torch.distributed.init_process_group("gloo")
+    camera = tiny.camera()
+    if distributed and torch.distributed.get_rank() > 0:  # an initialisation of its own: the first one's counts
+        for parameter in camera.parameters():
+            parameter.data.mul_(1.01)
     trained = fit(
-        tiny.camera(),
+        camera,
         tiny.loss(),
         source=tiny.source(),
-        settings=tiny.settings(steps=30, every=2, batch=4 if "--four" in sys.argv else 2),
+        settings=tiny.settings(
+            steps=30,
+            every=2,
+            batch=4 if "--four" in sys.argv else 2,
+            tolerance=0.02 if "--four" in sys.argv else None,
+        ),
         folder=folder / "checkpoints",
         resume="--resume" in sys.argv,
     )
-    if not distributed or torch.distributed.get_rank() == 0:
-        torch.save({"history": trained.history} | trained.camera.state_dict(), folder / "result.pt")
+    rank = torch.distributed.get_rank() if distributed else 0
+    torch.save({"history": trained.history} | trained.camera.state_dict(), folder / f"result{rank or ''}.pt")
     if distributed:
         torch.distributed.destroy_process_group()
 
