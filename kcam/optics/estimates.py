@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from kcam.optics.cells import sizes
 from kcam.optics.psf import Query, residual_path
 from kcam.optics.pupil import FINE, edge_response, from_image_side, map_response
 
@@ -103,7 +104,8 @@ def grid_error(query: Query, rays: Rays, *, period: float) -> float:
         losses.append(np.sqrt(loss.mean(0)))
     wrong = sum(2 * np.sqrt(light) * loss + loss**2 for loss in losses)
     captured = min(1.0, float((light * r).sum()) * 2 * math.pi * edge / _RADII)
-    return _SAFETY * float((wrong * r).sum() / (light * r).sum()) + _map_error(query, period=period, captured=captured)
+    of_maps = _map_error(query, wavelength=rays.wavelength, period=period, captured=captured)
+    return _SAFETY * float((wrong * r).sum() / (light * r).sum()) + of_maps
 
 
 def _cell_response(frequency: np.ndarray) -> np.ndarray:
@@ -116,17 +118,23 @@ def _from_rim(distance: np.ndarray, r: np.ndarray, airy: float) -> np.ndarray:
     return airy / (2 * math.pi**3) / ((distance**2 + airy**2 / 4) * (r + airy / 2))
 
 
-def _map_error(query: Query, *, period: float, captured: float) -> float:
+def _map_error(query: Query, *, wavelength: float, period: float, captured: float) -> float:
     """What maps of flat pixels cost: the rim cuts their pixels in cells of a finite size, and their low-pass droops.
 
-    The first is of all the light, and weighs more where little is captured (a fit); a map that is the aperture is not
-    cut. The droop is averaged over a window that the light fills, and weighted by 0.3, for most light falls short.
+    The first is a fit: it goes by the length of the rim for the light that passes, is 3 times as much where cells are
+    pixels, so that none takes light over from another, and weighs more where little is captured. The droop is averaged
+    over a window that the light fills, and weighted by 0.3, for most light falls short of that.
     """
-    lens = query.lens
-    if not lens.has_pixels:
+    found = [pixels for pixels in (e.pixel_map(query.wavelengths) for e in query.lens.elements) if pixels is not None]
+    if not found:
         return 0.0
-    maps = sum(element.pixel_map(query.wavelengths) is not None for element in lens.elements)
-    cut = 4e-4 / captured ** (1 / 3) if lens.aperture.discs() or maps > 1 else 0.0
+    cut, discs = 0.0, query.lens.aperture.discs()
+    if discs:
+        spacing = wavelength * float((query.sensor_distance / query.semi_aperture).detach()) / period
+        pixel = min(2 * half_width / count for count, half_width in sizes(query, found))
+        per_pixel = math.ceil(pixel * query.cells_per_sample / spacing)
+        rim = sum(radius for radius, _ in discs) / sum(weight * radius**2 for radius, weight in discs)
+        cut = 4e-4 * rim * {1: 3.0, 2: 1.6}.get(per_pixel, 1.0) / captured ** (1 / 3)
     r = (np.arange(_RADII) + 0.5) / _RADII
     frequency = r * query.half_window / period
     droop = np.abs(1 - map_response(frequency) ** 2) + map_response(1 - frequency) ** 2

@@ -16,25 +16,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcam.optics import sampling
 from kcam.optics.autograd import LinearMap, once_differentiable
+from kcam.optics.cells import Cells
 from kcam.optics.pixels import Pixels
 from kcam.optics.pupil import (
     EDGE_MARGIN,
     MapWeights,
     Pupil,
-    disc_cells,
     disc_weights,
     from_image_side,
     grid_nodes,
     grid_spacing,
-    map_weights,
     pupil_tau,
-    square_cells,
 )
 from kcam.optics.quadrants import unfold
 from kcam.optics.transforms import (
@@ -57,7 +54,6 @@ if TYPE_CHECKING:
     from kcam.optics.lens import Lens
 
 _GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
-_MOST_CELLS = 3072  # on which several maps are brought together exactly, beyond by the nearest pixel; and the rim
 
 
 @dataclass(frozen=True)
@@ -333,7 +329,7 @@ def _grid_group(
     coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
     amplitude = _amplitude(query, pupil, curved=curved)
     cell_area = (semi_aperture * spacing) ** 2
-    cells = _pixel_cells(query, wavelengths, count=count, spacing=spacing)
+    cells = Cells.of(query, wavelengths, count=count, spacing=spacing)
     if cells is None:
         quadrant = _disc_weights(query, count=count, spacing=spacing)
         weights, share = (quadrant, 4) if query.lens.even else (unfold(quadrant), 1)
@@ -422,106 +418,6 @@ def _disc_weights(query: Query, *, count: int, spacing: float) -> Tensor:
     return weights.to(query.device)
 
 
-@dataclass(frozen=True)
-class _Cells:
-    """All pixel maps of a lens on one grid of square cells over the pupil, and the way from there to the pupil grid.
-
-    half_width: of the grid of cells in units of the semi-aperture.
-    amplitude, power: (C, C) what the aperture transmits; of power, the rim by the exact area of each cell.
-    phases: (E, C, C) of the phase maps [rad], their `factors` (E, L).
-    weights: from the cells to the pupil grid.
-    """
-
-    half_width: float
-    amplitude: Tensor
-    power: Tensor
-    phases: Tensor
-    factors: Tensor
-    weights: MapWeights
-
-    def energy(self, semi_aperture: Tensor, vergences: Tensor) -> Tensor:
-        """INT power / (1 + V^2 r^2) d^2 u of spherical waves, (Z,) [m^2].
-
-        1 / (1 + s) = INT exp(-t) exp(-s t) dt by n nodes of Gauss and Laguerre, whose terms are products over x and y,
-        to (s / (2 + s))^2n = 1e-10; sources nearer than a semi-aperture or so are summed cell by cell.
-        """
-        count = self.power.shape[-1]
-        pitch = 2 * self.half_width / count * semi_aperture
-        centres = (torch.arange(count, dtype=torch.float64, device=vergences.device) + 0.5 - count / 2) * pitch
-        steepest = 2 * float((vergences.detach() * semi_aperture.detach()).abs().max()) ** 2
-        ratio = steepest / (2 + steepest)
-        if not ratio < 0.4:  # or NaN, which stays NaN
-            r2 = centres[:, None] ** 2 + centres**2
-            return pitch**2 * torch.stack([(self.power / (1 + v**2 * r2)).sum() for v in vergences])
-        nodes = math.ceil(math.log(1e-10) / (2 * math.log(max(ratio, 1e-12))))
-        times, weights = (torch.as_tensor(v).to(vergences) for v in np.polynomial.laguerre.laggauss(nodes))
-        profile = torch.exp(-times[:, None] * (vergences[:, None, None] * centres) ** 2)
-        rows = (profile.to(self.power) @ self.power).to(profile)
-        return pitch**2 * ((rows * profile).sum(-1) @ weights)
-
-
-def _pixel_cells(query: Query, wavelengths: Tensor, *, count: int, spacing: float) -> _Cells | None:
-    """The pixel maps of a lens on common cells, or None where it has none."""
-    discs = query.lens.aperture.discs()
-    maps = [pixels for pixels in (e.pixel_map(wavelengths) for e in query.lens.elements) if pixels is not None]
-    if not maps:
-        return None
-    semi = float(query.semi_aperture.detach())
-    if query.semi_aperture.requires_grad and any(pixels.half_width is not None for pixels in maps):
-        raise ValueError(
-            "a DOE with a pitch of its own does not follow a trainable aperture; leave pitch=None, so that the map "
-            "spans the aperture, or give the aperture's size as a number."
-        )
-    widths = [1.0 if pixels.half_width is None else float(pixels.half_width) / semi for pixels in maps]
-    sizes = [pixels.values.shape[-1] for pixels in maps]
-    # cells in which every map's pixels are whole, where there are such: a map that ends inside the aperture continues
-    # with its outermost pixels, and of one that reaches beyond it only the pixels that the aperture touches are kept
-    finest = max(range(len(maps)), key=lambda i: sizes[i] / widths[i])
-    base, half_width = sizes[finest], widths[finest]
-    common = math.lcm(*(size for size, width in zip(sizes, widths, strict=True) if width == half_width))
-    base = common if common <= _MOST_CELLS else base
-    refine = 1
-    if discs or len(maps) > 1:
-        most = max(_MOST_CELLS, 2 * count) / base
-        refine = max(1, math.ceil(min(query.cells_per_sample * count * half_width / base, most)))
-    missing = math.ceil((1 - half_width) * base / (2 * half_width) - 1e-9)  # on each side; < 0: to leave out
-    cells = (base + 2 * missing) * refine
-    half_width *= (base + 2 * missing) / base
-
-    def look_up(values: Tensor, width: float) -> Tensor:
-        if (values.shape[-1], width) == (cells, half_width):
-            return values.to(query.device, query.dtype)
-        centres = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells * 2 - 1
-        index = ((centres * half_width / width + 1) / 2 * values.shape[-1]).floor().long()
-        index = index.clamp(0, values.shape[-1] - 1).to(query.device)
-        return values.to(query.device, query.dtype).index_select(0, index).index_select(1, index)
-
-    amplitude = power = torch.ones((), dtype=query.dtype, device=query.device).expand(cells, cells)
-    if discs:
-        amplitude, power = disc_cells(
-            discs, cells, per_pixel=refine, half_width=half_width, dtype=query.dtype, device=query.device
-        )
-    phases, factors = [], []
-    for pixels, width in zip(maps, widths, strict=True):
-        values = look_up(pixels.values, width)
-        if pixels.factors is None:
-            amplitude, power = amplitude * values, power * values**2
-        else:
-            phases.append(values)
-            factors.append(pixels.factors)
-    if not phases:
-        phases, factors = [torch.zeros_like(amplitude)], [torch.ones_like(wavelengths)]
-    if not discs and half_width > 1:
-        rim = square_cells(cells, per_pixel=refine, half_width=half_width)
-        amplitude, power = amplitude * rim[0].to(amplitude), power * rim[1].to(power)
-
-    weights = map_weights(
-        cells, half_width=half_width, count=count, spacing=spacing, dtype=query.dtype, device=query.device
-    )
-    dispersed = torch.stack(factors).to(query.dtype)
-    return _Cells(half_width, amplitude, power, torch.stack(phases), dispersed, weights)
-
-
 def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: float) -> Tensor:
     """evaluate(tau), with the gradient to tau by a central difference where tau has one (value unchanged).
 
@@ -537,7 +433,7 @@ def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: flo
     return value + ((tau - tau.detach()) * slope).to(value)
 
 
-def _pixel_field(query: Query, cells: _Cells, layout: Transform, *, count: int, spacing: float, curved: bool) -> Tensor:
+def _pixel_field(query: Query, cells: Cells, layout: Transform, *, count: int, spacing: float, curved: bool) -> Tensor:
     """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (2, L, ...) in a transform's
     layout.
     """
@@ -549,7 +445,7 @@ def _pixel_field(query: Query, cells: _Cells, layout: Transform, *, count: int, 
     return _following(query.tau, both, spacing=spacing)
 
 
-def _onto_grid(query: Query, cells: _Cells, tau: float, *, count: int, spacing: float, curved: bool) -> LinearMap:
+def _onto_grid(query: Query, cells: Cells, tau: float, *, count: int, spacing: float, curved: bool) -> LinearMap:
     """The way from the cells to the pupil grid: that of the true plane, or on to the image-side plane."""
     if curved or query.paraxial:
         return cells.weights

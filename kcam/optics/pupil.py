@@ -98,7 +98,7 @@ def from_image_side(x: Tensor, y: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
     return x * scale, y * scale
 
 
-def _disc_area_below(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def disc_area_below(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Area of the unit disc's part in [0, x] x [0, y], x and y >= 0 (closed form)."""
     x, y = np.minimum(x, 1.0), np.minimum(y, 1.0)
     rim = np.sqrt(1 - y**2)
@@ -113,56 +113,6 @@ def kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.nda
     """Kaiser-windowed sinc with its zeros at the integers."""
     inside = np.clip(1 - (offset / half_width) ** 2, 0, None)
     return np.where(np.abs(offset) < half_width, np.sinc(offset) * np.i0(beta * np.sqrt(inside)) / np.i0(beta), 0.0)
-
-
-@functools.lru_cache(maxsize=12)
-@torch.inference_mode(False)
-def disc_cells(
-    discs: tuple[tuple[float, float], ...],
-    cells: int,
-    *,
-    per_pixel: int,
-    half_width: float,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> tuple[Tensor, Tensor]:
-    """Centred discs (radius, weight) on a square grid of flat cells: amplitude and power, (cells, cells) each.
-
-    power: the share of each cell that is inside, exact. amplitude: what the cells must hold to diffract as the rim
-    does. A share is the rim averaged over its cell, and a flat cell averages it again: both droop as sinc^2 of the
-    frequency in cycles per cell, which a twelfth of the second differences undoes to the fourth order. Cells of one
-    pixel exchange it, (per_pixel, per_pixel) of them; the next pixel may have any phase.
-
-    half_width: of the grid, in the unit of the radii.
-    """
-    share = np.zeros((cells, cells))
-    for radius, weight in discs:
-        edges = np.linspace(-half_width, half_width, cells + 1) / radius
-        sign = np.sign(edges)
-        area = _disc_area_below(np.abs(edges)[:, None], np.abs(edges)[None, :]) * sign[:, None] * sign[None, :]
-        share += weight * (np.diff(np.diff(area, axis=0), axis=1) / (edges[1] - edges[0]) ** 2).clip(0, 1)
-    amplitude = share
-    for _ in range(2):  # along x, then (transposed) along y
-        slope = np.diff(amplitude, prepend=0, append=0)
-        slope[:, ::per_pixel] = 0
-        amplitude = (amplitude - np.diff(slope) / 12).T
-    return torch.as_tensor(amplitude).to(device, dtype).contiguous(), torch.as_tensor(share).to(device, dtype)
-
-
-def square_cells(cells: int, *, per_pixel: int, half_width: float) -> tuple[Tensor, Tensor]:
-    """The square [-1, 1]^2 on a grid of flat cells, as `disc_cells` has discs: amplitude and power, float64.
-
-    Of a cell that an edge cuts, the share s would be (1 - s) / 2 cells too far outside: as much light as makes up for
-    it moves in by a cell, if that is of the same pixel.
-    """
-    edges = torch.linspace(-half_width, half_width, cells + 1, dtype=torch.float64).clamp(-1, 1)
-    share = edges.diff() * cells / (2 * half_width)
-    moved = share * (1 - share) / 2
-    moved = torch.cat([moved[: cells // 2], -moved[cells // 2 :]])  # > 0: to the next cell, < 0: to the one before
-    to_next, to_previous = moved.clamp(min=0), -moved.clamp(max=0)
-    to_next[per_pixel - 1 :: per_pixel] = to_previous[::per_pixel] = 0
-    along = share - to_next - to_previous + to_next.roll(1) + to_previous.roll(-1)
-    return along[:, None] * along, share[:, None] * share
 
 
 @functools.lru_cache(maxsize=1)
@@ -212,7 +162,7 @@ def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     for first in range(0, half, _NODES_AT_ONCE):  # of cells 25 times as many as nodes only a few rows are held
         last = min(first + _NODES_AT_ONCE, half)
         rows = edges[first * FINE : (last - 1) * FINE + taps + 1, None]
-        area = _disc_area_below(np.abs(rows), np.abs(edges)) * np.sign(rows) * np.sign(edges)
+        area = disc_area_below(np.abs(rows), np.abs(edges)) * np.sign(rows) * np.sign(edges)
         signal = torch.as_tensor(np.diff(np.diff(area, axis=0), axis=1) / cell**2)
         for _ in range(2):  # along the rows, then (transposed) along the columns
             signal = torch.nn.functional.conv1d(signal[:, None], kernel, stride=FINE)[:, 0].T
@@ -318,25 +268,6 @@ class MapWeights:
         """From the dense matrix (n, N)."""
         banded = (_Banded.build(m, dtype=dtype, device=device) for m in (matrix, matrix.T))
         return MapWeights(*banded)
-
-
-@functools.lru_cache(maxsize=6)
-@torch.inference_mode(False)
-def map_weights(
-    pixels: int, *, half_width: float, count: int, spacing: float, dtype: torch.dtype, device: torch.device
-) -> MapWeights:
-    """Weights that bring a map of flat square pixels onto the true pupil plane, through a low-pass at its Nyquist.
-
-    Args:
-        pixels: n, the map is n x n.
-        half_width: of the map in units of the semi-aperture (1: it spans the bounding square).
-        count, spacing: of the pupil grid.
-        dtype: of the weights, which are built in float64.
-    Valid when the grid has at least 2.5 samples per cycle of what reaches the window (the default sampling).
-    """
-    edges = torch.linspace(-half_width, half_width, pixels + 1, dtype=torch.float64)
-    nodes = grid_nodes(count, spacing=spacing)
-    return MapWeights.build(pixel_weights(edges, nodes, spacing=spacing).T, dtype=dtype, device=device)
 
 
 def pixel_under(values: Tensor, half_width: float | Tensor | None, axis: Tensor, semi_aperture: Tensor) -> Tensor:

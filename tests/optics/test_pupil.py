@@ -1,4 +1,4 @@
-"""Edge weights of a disc, an aperture's rim in flat cells, and the way to the image-side plane."""
+"""Edge weights of a disc, and the way to the image-side plane."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import math
 
 import pytest
 import torch
-from scipy import special
 
 from kcam import measure
 from kcam.optics import pupil
-from kcam.optics.pupil import disc_cells, disc_weights, grid_nodes, grid_spacing, square_cells
+from kcam.optics.pupil import disc_weights, grid_nodes, grid_spacing
 from kcam.optics.warp import Warp
 
 
@@ -41,63 +40,6 @@ def test_edge_weights_take_little_memory() -> None:
     assert peak < 25 * 8 * count**2
 
 
-# ---- the rim in flat cells ---------------------------------------------------------------------------------------
-
-
-LIKE = {"dtype": torch.float64, "device": torch.device("cpu")}
-
-
-def spectrum(values: torch.Tensor, frequency: float, *, half_width: float) -> torch.Tensor:
-    """The Fourier transform of flat cells at (frequency, 0) [cycles per unit]."""
-    n = values.shape[-1]
-    cell = 2 * half_width / n
-    centres = (torch.arange(n, dtype=torch.float64) + 0.5 - n / 2) * cell
-    along = torch.exp(-2j * math.pi * frequency * centres) * cell * torch.sinc(torch.tensor(frequency * cell))
-    return (values.to(along) @ along).sum() * cell
-
-
-def errors(cells: tuple[torch.Tensor, torch.Tensor], truth: float, frequency: float, half_width: float) -> list[float]:
-    return [float((spectrum(values, frequency, half_width=half_width) - truth).abs()) for values in cells]
-
-
-@pytest.mark.parametrize(("frequency", "bound"), [(0.5, 2e-7), (1.3, 1e-4), (3.3, 1e-3)])
-def test_discs_of_cells_diffract_as_their_rim(frequency: float, bound: float) -> None:
-    """Against J1(2 pi f) / f, and beside the shares of light alone, which droop. Frequency in cycles per radius."""
-    cells = disc_cells(((1.0, 1.0),), 210, per_pixel=210, half_width=1.05, **LIKE)
-    error, plain = errors(cells, special.j1(2 * math.pi * frequency) / frequency, frequency, 1.05)
-    envelope = 1 / (math.pi * frequency**1.5)
-    print(f"disc of cells at {frequency}: {error / envelope:.1e} of the envelope, by shares {plain / envelope:.1e}")
-    assert error <= bound * envelope
-    assert plain > 5 * error
-    assert float(cells[1].sum()) * (2.1 / 210) ** 2 == pytest.approx(math.pi, rel=1e-12)
-
-
-@pytest.mark.parametrize("count", [240, 241])
-@pytest.mark.parametrize(("frequency", "bound"), [(0.3, 2e-7), (1.2, 2e-5), (4.2, 1e-3)])
-def test_squares_of_cells_diffract_as_their_edges(count: int, frequency: float, bound: float) -> None:
-    half_width = 1.0123
-    cells = square_cells(count, per_pixel=count, half_width=half_width)
-    truth = 2 * math.sin(2 * math.pi * frequency) / (math.pi * frequency)
-    error, plain = errors(cells, truth, frequency, half_width)
-    assert error <= bound * 2 / (math.pi * frequency)
-    assert plain > 5 * error
-    assert float(cells[1].sum()) * (2 * half_width / count) ** 2 == pytest.approx(4, rel=1e-12)
-
-
-def test_light_at_the_rim_stays_in_its_pixel() -> None:
-    """The next pixel may have any phase."""
-    for per_pixel in (1, 3, 6):
-        for amplitude, power in (
-            disc_cells(((1.0, 1.0), (0.4, -1.0)), 54, per_pixel=per_pixel, half_width=1.07, **LIKE),
-            square_cells(54, per_pixel=per_pixel, half_width=1.07),
-        ):
-            pixels = [
-                v.unflatten(1, (-1, per_pixel)).unflatten(0, (-1, per_pixel)).sum((1, 3)) for v in (amplitude, power)
-            ]
-            torch.testing.assert_close(*pixels, rtol=0, atol=1e-13)
-            assert torch.equal(amplitude, power) == (per_pixel == 1)
-
-
 # ---- the way to the image-side plane -----------------------------------------------------------------------------
 
 
@@ -107,7 +49,8 @@ def test_a_wave_is_carried_to_the_image_side(tau: float, frequency: tuple[float,
     """rho^2 = rho'^2 / (1 + tau - tau rho'^2): a plane wave of the true plane, evaluated there. Cycles per sample."""
     count = 256
     spacing = grid_spacing(count)
-    warp = Warp.build(count, spacing=spacing, tau=tau, corner=1.05, **LIKE)
+    like = {"dtype": torch.float64, "device": torch.device("cpu")}
+    warp = Warp.build(count, spacing=spacing, tau=tau, corner=1.05, **like)
     assert warp is not None
     nodes = grid_nodes(count, spacing=spacing)
     x, y = nodes[None, :], nodes[:, None]

@@ -9,7 +9,8 @@ import torch
 from torch import nn
 
 from kcam import optics
-from kcam.optics import PROPAGATORS, pixels, psf, sampling
+from kcam.optics import PROPAGATORS, pixels, sampling
+from kcam.optics.cells import Cells
 from kcam.optics.pixels import Pixels, _Parities
 from kcam.optics.quadrants import by_x, join, join_adjoint, parities, split, unfold
 from kcam.optics.transforms import MatrixTransform
@@ -230,14 +231,14 @@ def test_terms_of_its_own_are_symmetric_only_where_the_subclass_says_so() -> Non
 def test_the_energy_that_passes_pixel_maps(vergence: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against the sum over all cells, from infinity to a twentieth of the semi-aperture."""
     of, kept = lens(aperture=optics.SquareAperture(2 * mm), doe=True), []
-    build = psf._pixel_cells
-    monkeypatch.setattr(psf, "_pixel_cells", lambda *a, **k: kept.append(build(*a, **k)) or kept[-1])
+    build = Cells.of
+    monkeypatch.setattr(Cells, "of", lambda *a, **k: kept.append(build(*a, **k)) or kept[-1])
     of.psf([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(5, 5))
     cells, semi = kept[0], torch.tensor(1 * mm, dtype=DOUBLE)
-    count = cells.power.shape[-1]
-    x = (torch.arange(count, dtype=DOUBLE) + 0.5 - count / 2) * (2 * cells.half_width / count) * semi
+    edges = cells.edges * semi
+    x, area = (edges[1:] + edges[:-1]) / 2, edges.diff()[:, None] * edges.diff()
     for other in (0.0, -0.5):  # beside one that is far
         found = cells.energy(semi, torch.tensor([other, vergence], dtype=DOUBLE))
         for v, own in zip((other, vergence), found, strict=True):
-            truth = (cells.power.double() / (1 + v**2 * (x[:, None] ** 2 + x**2))).sum() * (x[1] - x[0]) ** 2
+            truth = (cells.power.double() * area / (1 + v**2 * (x[:, None] ** 2 + x**2))).sum()
             torch.testing.assert_close(own, truth, rtol=1e-6, atol=0.0, equal_nan=True)
