@@ -6,7 +6,8 @@
 Two cubes of 256 x 256 pixels and 28 bands, an 891 x 891 DOE in the midst of its training, PSFs of 297 x 297 pixels, a
 tile of 28 x 28 filters, a clip, a 3 x 3 convolution; gradients to DOE, tile and convolution. Both sides share
 the stages behind the filter, and the loss: VGG16 with random weights, Gram matrices, and L2 between what the sensor
-records with and without optics.
+records with and without optics. Both take all rows of the batch at once, as a textbook does; `kcam train` takes what
+follows the sensor row by row.
 
 The straightforward camera computes a padded FFT of the 891 x 891 pupil per wavelength, an FFT convolution for each
 band, and weighs each with the tile. PSFs are integrated over the pixels, which the textbook does by averaging 2 x 2
@@ -145,7 +146,7 @@ def style_loss(sizes: Sizes) -> StyleLoss:
 
 
 def kcam_picture(camera: Camera, scene: Scene) -> Picture:
-    """As `kcam.style.step.Step` takes it."""
+    """As `kcam.style.step` takes it, for all rows at once."""
     picture, recorded = photograph(camera, scene, lambda row, stage: torch.Generator(), recorded=True)
     assert recorded is not None
     return picture, recorded

@@ -119,7 +119,7 @@ def cell_edges(maps: Maps, widest: float) -> tuple[np.ndarray, np.ndarray]:
     return np.append(edges, 1.0), np.append(within == 0, True)
 
 
-@functools.lru_cache(maxsize=12)
+@functools.lru_cache(maxsize=8)
 @torch.inference_mode(False)
 def disc_cells(
     discs: tuple[tuple[float, float], ...], maps: Maps, widest: float, *, dtype: torch.dtype, device: torch.device

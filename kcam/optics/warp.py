@@ -19,7 +19,7 @@ from kcam.optics.pupil import grid_nodes, kaiser_sinc
 
 _SLAB = 64  # columns: narrow enough to leave out most zeros, wide enough for a matrix product
 _HALF_WIDTH = 16  # samples; half width of the interpolating sinc
-_BETA = 10.4  # leaves 2e-6 of a field's mean off, 2e-5 to 0.76 of the Nyquist frequency, 2e-4 at 0.8: kappa 2.5
+_BETA = 10.4  # both passes: 4e-6 of a field's mean off, 6e-5 at 0.76 of the Nyquist frequency; kappa 2.5 needs 0.8
 _SMALLEST = 3e-5  # coefficient of the series that is kept
 _MOST_TERMS = 64
 

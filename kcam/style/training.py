@@ -62,8 +62,8 @@ def fit(
     What is random is drawn by seed and step, so that a run that was killed goes on from its last checkpoint with the
     same weights, bit for bit, on the same machine, torch and number of threads. One exception: a run that was stopped
     between two checkpoints and then meets a loss that is not finite goes back to where it was stopped. Under torchrun
-    each process takes its rows of the batch from the sensor on, and all take the optics of the whole batch: the camera
-    and its loss curve are those of one process, bit for bit, with as many threads in each.
+    each process takes its rows of the batch from the first noise or the demosaic on, and all take what precedes that,
+    for the whole batch: camera and loss curve are those of one process, bit for bit, with as many threads in each.
 
     Args:      camera: trains in place; its nn.Parameters in the parts with a learning rate.
                loss: the style.
