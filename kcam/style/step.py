@@ -121,6 +121,16 @@ def gradients(
         slopes.append(_slopes(total / len(light), [signal, *parameters]))
         mark("gradient")
     found = gathered(torch.stack(values), world).mean(0).tolist()
+    _assign(slopes, light=light, parameters=parameters, world=world)
+    mark("gradient")
+    names = ("total", *terms)
+    return Taken(dict(zip(names, found, strict=True)), torch.cat(pictures).detach(), shown[list(rows)])
+
+
+def _assign(
+    slopes: Sequence[Sequence[Tensor | None]], *, light: Tensor, parameters: Sequence[nn.Parameter], world: int
+) -> None:
+    """Make `grad` of the rows' gradients onto the light and the parameters: behind the light, and through it."""
     depends = torch.tensor([[slope is not None for slope in row] for row in slopes], device=light.device)
     reached = gathered(depends, world).any(0).tolist()
     members = [(index, value) for index, value in enumerate([light[:1], *parameters]) if reached[index]]
@@ -137,9 +147,6 @@ def gradients(
             if slope is not None:
                 own = of_the_first(slope, world)
                 parameter.grad = own if parameter.grad is None else parameter.grad + own
-    mark("gradient")
-    names = ("total", *terms)
-    return Taken(dict(zip(names, found, strict=True)), torch.cat(pictures).detach(), shown[list(rows)])
 
 
 def _slopes(total: Tensor, of: Sequence[Tensor]) -> list[Tensor | None]:
