@@ -72,9 +72,8 @@ def _spectrum_band(query: Query, index: int, *, count: int, pitch: float) -> Ten
     transmission, power = _point_transmission(query, pupil, pitch=pitch, count=count)
     falloff = 1 / (1 + query.vergences[:, None, None] ** 2 * r2)
     field = torch.complex(phase.cos(), phase.sin()) * (transmission * torch.sqrt(falloff))
-    for element in query.lens.elements:
-        pixels = element.pixel_map(one.wavelengths.to(query.device))
-        if pixels is not None and pixels.factors is not None:
+    for pixels in query.lens.pixel_maps(one.wavelengths.to(query.device)):
+        if pixels.factors is not None:
             angle = pixels.factors * pixel_under(pixels.values.to(a), pixels.half_width, axis, a)
             field = field * torch.complex(angle.cos(), angle.sin())
     energy = (power * falloff).sum((-2, -1)) * pitch**2

@@ -45,7 +45,7 @@ class Cells:
     def of(query: Query, wavelengths: Tensor, *, count: int, spacing: float) -> Cells | None:
         """Those of a query on a pupil grid; None where its lens has no pixels."""
         discs = query.lens.aperture.discs()
-        found = [pixels for pixels in (e.pixel_map(wavelengths) for e in query.lens.elements) if pixels is not None]
+        found = query.lens.pixel_maps(wavelengths)
         if not found:
             return None
         if query.semi_aperture.requires_grad and any(pixels.half_width is not None for pixels in found):

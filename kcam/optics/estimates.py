@@ -125,7 +125,7 @@ def _map_error(query: Query, *, wavelength: float, period: float, captured: floa
     pixels, so that none takes light over from another, and weighs more where little is captured. The droop is averaged
     over a window that the light fills, and weighted by 0.3, for most light falls short of that.
     """
-    found = [pixels for pixels in (e.pixel_map(query.wavelengths) for e in query.lens.elements) if pixels is not None]
+    found = query.lens.pixel_maps(query.wavelengths)
     if not found:
         return 0.0
     cut, discs = 0.0, query.lens.aperture.discs()
@@ -144,9 +144,8 @@ def _map_error(query: Query, *, wavelength: float, period: float, captured: floa
 def jumps(query: Query) -> float:
     """The rms step between neighbouring pixels of the phase maps, wrapped [rad]."""
     total = 0.0
-    for element in query.lens.elements:
-        pixels = element.pixel_map(query.wavelengths)
-        if pixels is not None and pixels.factors is not None and pixels.values.shape[-1] > 1:
+    for pixels in query.lens.pixel_maps(query.wavelengths):
+        if pixels.factors is not None and pixels.values.shape[-1] > 1:
             total += float(torch.cat([step.flatten() for step in pixels.steps()]).square().mean())
     return math.sqrt(total)
 
@@ -154,8 +153,7 @@ def jumps(query: Query) -> float:
 def map_phase(query: Query) -> float:
     """The rms of what the phase maps add, unwrapped as they are given [rad]."""
     total = 0.0
-    for element in query.lens.elements:
-        pixels = element.pixel_map(query.wavelengths)
-        if pixels is not None and pixels.factors is not None:
+    for pixels in query.lens.pixel_maps(query.wavelengths):
+        if pixels.factors is not None:
             total += float(pixels.largest_phase().var(correction=0))
     return math.sqrt(total)

@@ -391,8 +391,7 @@ class Imaging(Stage):
 
 def _map_work(query: Query) -> float:
     """Pixels of the maps, and three times the samples that their field is warped onto (a fit), for each wavelength."""
-    maps = [element.pixel_map(query.wavelengths) for element in query.lens.elements]
-    pixels = sum(found.values.numel() for found in maps if found is not None)
+    pixels = sum(found.values.numel() for found in query.lens.pixel_maps(query.wavelengths))
     pairs = zip(query.displacement.tolist(), query.wavelengths.tolist(), strict=True)
     counts = [samples_by_rule(query, displacement=spread, wavelength=wavelength) for spread, wavelength in pairs]
     return float(sum(pixels + (0 if query.paraxial else 3 * count**2) for count in counts))

@@ -11,7 +11,7 @@ from numbers import Integral
 import torch
 from torch import Tensor, nn
 
-from kcam.optics.elements import DOE, Aperture, Element, PlanoConvexLens, Scalar, float64, set_scalar
+from kcam.optics.elements import DOE, Aperture, Element, PixelMap, PlanoConvexLens, Scalar, float64, set_scalar
 from kcam.optics.explain import Explanation, explain
 from kcam.optics.propagation import choose
 from kcam.optics.psf import Query
@@ -122,9 +122,11 @@ class Lens(nn.Module):
     def has_pixel_phase(self) -> bool:
         """Whether an element has its phase on flat pixels, which has no slope."""
         grid = wavelength_grid([self.focus_wavelength])
-        return any(
-            pixels.factors is not None for pixels in (e.pixel_map(grid) for e in self.elements) if pixels is not None
-        )
+        return any(pixels.factors is not None for pixels in self.pixel_maps(grid))
+
+    def pixel_maps(self, wavelengths: Tensor) -> list[PixelMap]:
+        """The maps of flat pixels among the elements, for wavelengths (L,) [m], in the order of the light."""
+        return [pixels for pixels in (e.pixel_map(wavelengths) for e in self.elements) if pixels is not None]
 
     def pixel_phase_displacement(self, query: Query) -> float:
         """How far flat pixels send all but a few 1e-4 of their light on the sensor [m].
@@ -134,9 +136,8 @@ class Lens(nn.Module):
         order M.
         """
         total = 0.0
-        for element in self.elements:
-            pixels = element.pixel_map(query.wavelengths)
-            if pixels is None or pixels.factors is None or pixels.values.shape[-1] < 2:
+        for pixels in self.pixel_maps(query.wavelengths):
+            if pixels.factors is None or pixels.values.shape[-1] < 2:
                 continue
             half_width = query.semi_aperture.detach() if pixels.half_width is None else pixels.half_width
             pitch = 2 * float(half_width) / pixels.values.shape[-1]
