@@ -6,8 +6,8 @@
 Two cubes of 256 x 256 pixels and 28 bands, an 891 x 891 DOE in the midst of its training, PSFs of 297 x 297 pixels, a
 tile of 28 x 28 filters, a clip, a 3 x 3 convolution; gradients to DOE, tile and convolution. Both sides share
 the stages behind the filter, and the loss: VGG16 with random weights, Gram matrices, and L2 between what the sensor
-records with and without optics. Both take all rows of the batch at once, as a textbook does; `kcam train` takes what
-follows the sensor row by row.
+records with and without optics. Both take all rows of the batch at once, as a textbook does; `kcam train` takes them
+row by row from the first noise or the demosaic on.
 
 The straightforward camera computes a padded FFT of the 891 x 891 pupil per wavelength, an FFT convolution for each
 band, and weighs each with the tile. PSFs are integrated over the pixels, which the textbook does by averaging 2 x 2
@@ -251,9 +251,9 @@ class Bench:
         shape = (sizes.batch, 3, sizes.picture, sizes.picture)
         self.onto_picture = torch.randn(*shape, generator=generator)  # white: every frequency counts
         self.onto_light = torch.randn(sizes.batch, 1, *shape[2:], generator=generator)
-        self.truths = {integrate: self.unfused(self.cameras[integrate]) for integrate in (True, False)}
-        self.truth = self.truths[True]
         camera = self.cameras[True]
+        self.truths = {integrate: self.unfused(own) for integrate, own in self.cameras.items()}
+        self.truth = self.truths[True] | self.unfused_whole(camera)
         self.plans = {tolerance: camera.plan(self.scene, tolerance=tolerance) for tolerance in TOLERANCES}
         self.planned = {
             f"kcam, tolerance {tolerance:g}": Camera(*plan.apply(camera), context=camera.context)
@@ -261,12 +261,17 @@ class Bench:
         }
 
     def unfused(self, camera: Camera) -> dict[str, Any]:
-        """Pictures, loss and gradients of a camera in float64, nothing of it fused."""
+        """Pictures and gradients of a camera in float64, nothing of it fused."""
+        camera, scene = copy.deepcopy(camera).double(), self.scene.to(dtype=DOUBLE)
+        of_camera, picture = self.camera_step(camera, lambda: unfused_picture(camera, scene))
+        return {"picture": picture, "camera": of_camera}
+
+    def unfused_whole(self, camera: Camera) -> dict[str, Any]:
+        """Loss and gradients of a camera and its loss in float64, nothing of it fused."""
         camera, scene = copy.deepcopy(camera).double(), self.scene.to(dtype=DOUBLE)
         loss = copy.deepcopy(self.loss).double()
-        of_camera, picture = self.camera_step(camera, lambda: unfused_picture(camera, scene))
         whole, terms = self.whole_step(camera, lambda: unfused_picture(camera, scene), loss=loss)
-        return {"picture": picture, "camera": of_camera, "whole": whole, "terms": terms}
+        return {"whole": whole, "terms": terms}
 
     def camera_step(self, camera: Camera, take: Callable[[], Picture]) -> tuple[dict[str, Tensor], Tensor]:
         """The camera forward and backward, from fixed gradients of its picture and of the sensor's signal."""

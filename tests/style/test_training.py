@@ -227,9 +227,9 @@ def test_rows_do_not_depend_on_their_neighbours() -> None:
     assert (both[1] - alone[0]).abs().max() < 1e-5  # the transforms of a batch round otherwise
 
 
-def take(camera: Camera, loss: StyleLoss, *, rows: int = 4) -> dict[str, torch.Tensor]:
+def take(camera: Camera, loss: StyleLoss) -> dict[str, torch.Tensor]:
     """A step's gradients, and the values of its terms."""
-    scene, _ = tiny.source().draw(range(rows), seed=0, step=0)
+    scene, _ = tiny.source().draw(range(4), seed=0, step=0)
     named = dict(camera.named_parameters())
     taken = gradients(
         camera, loss, scene, draws, parameters=list(named.values()), turn=0, emphasis=1.5, mark=lambda part: None
