@@ -1,4 +1,4 @@
-"""Maps of flat pixels on common cells, in which each pixel of each map is whole, and the aperture's rim in them."""
+"""Maps of flat pixels and the aperture's rim on common cells, in which each pixel of each map is whole; their field."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcam.optics.autograd import once_differentiable
 from kcam.optics.pupil import MapWeights, disc_area_below, grid_nodes, pixel_weights
+from kcam.optics.transforms import Pair, Transform, sines
+from kcam.precision import full_precision
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from kcam.optics.elements import PixelMap
     from kcam.optics.psf import Query
+    from kcam.optics.warp import Warp
 
 _MOST_CELLS = 3072  # that the rim asks for
 Maps = tuple[tuple[int, float], ...]
@@ -75,6 +79,14 @@ class Cells:
         weights = map_weights(maps, widest, count=count, spacing=spacing, **like)
         dispersed = torch.stack(factors).to(query.dtype)
         return Cells(torch.as_tensor(edges), amplitude, power, torch.stack(phases), dispersed, weights)
+
+    def field(self, warp: Warp | None, layout: Transform) -> Tensor:
+        """Transmission and phase on the true plane's grid, or on to the image-side plane's by `warp`.
+
+        Real and imaginary part, (2, L, ...) in a transform's layout.
+        """
+        onto = self.weights if warp is None else _Warped(self.weights, warp)
+        return _PixelField.apply(self.phases, self.factors, self.amplitude, onto, layout)
 
     def energy(self, semi_aperture: Tensor, vergences: Tensor) -> Tensor:
         """INT power / (1 + V^2 r^2) d^2 u of spherical waves, (Z,) [m^2].
@@ -170,3 +182,56 @@ def map_weights(
     edges = torch.as_tensor(cell_edges(maps, widest)[0])
     nodes = grid_nodes(count, spacing=spacing)
     return MapWeights.build(pixel_weights(edges, nodes, spacing=spacing).T, dtype=dtype, device=device)
+
+
+@dataclass(frozen=True)
+class _Warped:
+    """Cells onto the true plane's grid, and from there to the image-side plane."""
+
+    weights: MapWeights
+    warp: Warp
+
+    def forward(self, field: Tensor) -> Tensor:
+        return self.warp.forward(self.weights.forward(field))
+
+    def adjoint(self, grid: Tensor) -> Tensor:
+        return self.weights.adjoint(self.warp.adjoint(grid))
+
+
+class _PixelField(torch.autograd.Function):
+    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength, real and imaginary part (2, L, ...);
+    no sines are kept for the backward pass.
+    """
+
+    @staticmethod
+    def forward(ctx, phases, factors, amplitude, onto, layout):
+        ctx.save_for_backward(phases, factors, amplitude)
+        ctx.onto, ctx.layout = onto, layout
+        fields = (values.mul_(amplitude) for factor in factors.T for values in _sines(factor, phases))
+        grids = [layout.arrange(onto.forward(field)) for field in fields]
+        return torch.stack(grids[::2] + grids[1::2]).unflatten(0, (2, -1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, saved, grad):
+        phases, factors, amplitude = saved
+        d_phases = torch.zeros_like(phases)
+        d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
+        for index, factor in enumerate(factors.T):
+            with full_precision(grad.device):
+                onto_re, onto_im = (ctx.onto.adjoint(ctx.layout.disarrange(part[index])) for part in grad)
+            cosine, sine = _sines(factor, phases)
+            if d_amplitude is not None:
+                d_amplitude.addcmul_(cosine, onto_re).addcmul_(sine, onto_im)
+            d_angle = cosine.mul_(onto_im).addcmul_(sine, onto_re, value=-1)
+            for d_phase, own in zip(d_phases, factor, strict=True):
+                d_phase.addcmul_(d_angle, own)
+        return d_phases.mul_(amplitude), None, d_amplitude, None, None
+
+
+def _sines(factor: Tensor, phases: Tensor) -> Pair:
+    """Cosine and sine of sum_e factor_e * phase_e."""
+    angle = factor[0] * phases[0]
+    for own, phase in zip(factor[1:], phases[1:], strict=True):
+        angle.addcmul_(own, phase)
+    return sines(angle)

@@ -20,12 +20,10 @@ import torch
 from torch import Tensor
 
 from kcam.optics import sampling
-from kcam.optics.autograd import LinearMap, once_differentiable
 from kcam.optics.cells import Cells
 from kcam.optics.pixels import Pixels
 from kcam.optics.pupil import (
     EDGE_MARGIN,
-    MapWeights,
     Pupil,
     disc_weights,
     from_image_side,
@@ -40,15 +38,12 @@ from kcam.optics.transforms import (
     CurvedTransform,
     FFTTransform,
     MatrixTransform,
-    Pair,
     Transform,
     fast_length,
     mean_slope,
     pupil_intensity,
-    sines,
 )
 from kcam.optics.warp import Warp
-from kcam.precision import full_precision
 
 if TYPE_CHECKING:
     from kcam.optics.lens import Lens
@@ -439,69 +434,14 @@ def _pixel_field(query: Query, cells: Cells, layout: Transform, *, count: int, s
     """
 
     def both(tau: float) -> Tensor:
-        onto = _onto_grid(query, cells, tau, count=count, spacing=spacing, curved=curved)
-        return _PixelField.apply(cells.phases, cells.factors, cells.amplitude, onto, layout)
+        return cells.field(_warp(query, tau, count=count, spacing=spacing, curved=curved), layout)
 
     return _following(query.tau, both, spacing=spacing)
 
 
-def _onto_grid(query: Query, cells: Cells, tau: float, *, count: int, spacing: float, curved: bool) -> LinearMap:
-    """The way from the cells to the pupil grid: that of the true plane, or on to the image-side plane."""
+def _warp(query: Query, tau: float, *, count: int, spacing: float, curved: bool) -> Warp | None:
+    """The way from the true pupil plane to the image-side plane, where the kernel needs it."""
     if curved or query.paraxial:
-        return cells.weights
+        return None
     corner = 1.05 if query.lens.round else 1.05 * math.sqrt(2)
-    warp = Warp.build(count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device)
-    return cells.weights if warp is None else _Warped(cells.weights, warp)
-
-
-@dataclass(frozen=True)
-class _Warped:
-    """Cells onto the true plane's grid, and from there to the image-side plane."""
-
-    weights: MapWeights
-    warp: Warp
-
-    def forward(self, field: Tensor) -> Tensor:
-        return self.warp.forward(self.weights.forward(field))
-
-    def adjoint(self, grid: Tensor) -> Tensor:
-        return self.weights.adjoint(self.warp.adjoint(grid))
-
-
-class _PixelField(torch.autograd.Function):
-    """Low-passed amplitude * exp(i sum_e factor_e * phase_e) of each wavelength, real and imaginary part (2, L, ...);
-    no sines are kept for the backward pass.
-    """
-
-    @staticmethod
-    def forward(ctx, phases, factors, amplitude, onto, layout):
-        ctx.save_for_backward(phases, factors, amplitude)
-        ctx.onto, ctx.layout = onto, layout
-        fields = (values.mul_(amplitude) for factor in factors.T for values in _sines(factor, phases))
-        grids = [layout.arrange(onto.forward(field)) for field in fields]
-        return torch.stack(grids[::2] + grids[1::2]).unflatten(0, (2, -1))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, saved, grad):
-        phases, factors, amplitude = saved
-        d_phases = torch.zeros_like(phases)
-        d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
-        for index, factor in enumerate(factors.T):
-            with full_precision(grad.device):
-                onto_re, onto_im = (ctx.onto.adjoint(ctx.layout.disarrange(part[index])) for part in grad)
-            cosine, sine = _sines(factor, phases)
-            if d_amplitude is not None:
-                d_amplitude.addcmul_(cosine, onto_re).addcmul_(sine, onto_im)
-            d_angle = cosine.mul_(onto_im).addcmul_(sine, onto_re, value=-1)
-            for d_phase, own in zip(d_phases, factor, strict=True):
-                d_phase.addcmul_(d_angle, own)
-        return d_phases.mul_(amplitude), None, d_amplitude, None, None
-
-
-def _sines(factor: Tensor, phases: Tensor) -> Pair:
-    """Cosine and sine of sum_e factor_e * phase_e."""
-    angle = factor[0] * phases[0]
-    for own, phase in zip(factor[1:], phases[1:], strict=True):
-        angle.addcmul_(own, phase)
-    return sines(angle)
+    return Warp.build(count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device)

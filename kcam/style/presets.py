@@ -100,7 +100,7 @@ class Preset:
         return settings
 
 
-AIM = 0.13
+AIM = 0.12
 """Content loss at which faces are still there, and strokes too."""
 PAINTED: dict[str, Any] = {"colour": 0.7, "content": 0.5, "levels": (2, 4), "window": 15, "whole": True}
 """Contents are measured from half the size on, which leaves room for strokes; light and dark over the whole picture."""

@@ -71,7 +71,7 @@ class Settings:
         if not all(0 <= rate < math.inf for rate in self.rates.values()) or not any(self.rates.values()):
             raise ValueError(f"learning rates must be finite and >= 0, and one of them above, got {self.rates}.")
         if self.content_aim is not None and not 0 < self.content_aim < 2:
-            raise ValueError(f"content_aim must be within 0..2, got {self.content_aim:g}. Use 0.13 or None.")
+            raise ValueError(f"content_aim must be within 0..2, got {self.content_aim:g}. Use 0.12 or None.")
         if not self.clip > 0 or not 0 <= self.average < 1:
             raise ValueError(f"expected clip > 0 and 0 <= average < 1, got {self.clip:g} and {self.average:g}.")
 
