@@ -21,9 +21,9 @@ SEEN_AT_ONCE = 2**20
 TILE = 512
 LEAST_VARIANCE = 1e-5
 """Added to what a normalisation divides by."""
-LENGTH, WIDTH = 8.0, 2.4
+LENGTH, WIDTH = 7.0, 2.2
 """Standard deviations of drawn-out noise along its direction and across [pixels]."""
-LONGEST = 16
+LONGEST = 14
 DIRECTIONS = 8
 CELL, SMOOTHED = 8, 1.5
 """Pixels between the random vectors that make directions flow, and the Gaussian that smooths these [cells]."""
@@ -93,7 +93,7 @@ class StyleStage(Stage):
     convolution also sees what the first one made: the detail of the picture and of the noise. Without noise a network
     that sees only the picture must leave an even area even; planes of Gaussian noise, beside the picture and at a
     quarter of its size, let strokes grow there (as in texture networks). Those beside the picture are drawn out along
-    and across directions that flow over the picture, by Gaussians 8 pixels long and 2.4 wide and by twice as large
+    and across directions that flow over the picture, by Gaussians 7 pixels long and 2.2 wide and by twice as large
     ones: from white noise a small network learns grain before it learns strokes. As it is built it changes nothing but
     values below 0.03 and above 0.97: the last convolution starts at 0, M at the identity.
 
@@ -281,7 +281,7 @@ def _flowing(draw: Callable[[int, int, int], Tensor], planes: int, height: int, 
 
 
 def _drawn_out(white: Tensor, kernels: Tensor) -> Tensor:
-    """White noise (B,planes,h,w) convolved with each kernel where these lie inside: (B,planes,8,h-32,w-32).
+    """White noise (B,planes,h,w) convolved with each kernel where these lie inside: (B,planes,8,h-28,w-28).
 
     By FFT, a third of the time of the sums; one at a time, so that each stays in the processor's cache.
     """
@@ -296,7 +296,7 @@ def _drawn_out(white: Tensor, kernels: Tensor) -> Tensor:
 
 
 def stroke_kernels() -> Tensor:
-    """Gaussians of sigma 8 by 2.4 pixels along 8 directions, (8,33,33), that keep the variance of noise."""
+    """Gaussians of sigma 7 by 2.2 pixels along 8 directions, (8,29,29), that keep the variance of noise."""
     place = torch.arange(-LONGEST, LONGEST + 1, dtype=torch.float64)
     y, x = torch.meshgrid(place, place, indexing="ij")
     angle = torch.arange(DIRECTIONS, dtype=torch.float64)[:, None, None] * (math.pi / DIRECTIONS)

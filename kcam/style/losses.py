@@ -18,7 +18,6 @@ FLOOR = 0.1  # of a natural picture's variance: what a flat style is divided by
 DIRECTIONS = 16  # of colour
 TURNS = 4
 COLOUR_FLOOR = 0.05  # least standard deviation that a style's colours are divided by
-FLAT = 1e-3  # local variance of luminance below which a scene's contents count less
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -145,30 +144,37 @@ def luminance(picture: Tensor) -> Tensor:
 
 
 def correlation_loss(
-    picture: Tensor, scene: Tensor, *, levels: tuple[int, ...], window: int = 11, whole: bool = False
+    picture: Tensor,
+    scene: Tensor,
+    *,
+    levels: tuple[int, ...],
+    window: int = 11,
+    whole: bool = False,
+    flat: float = 1e-3,
 ) -> Tensor:
     """How much of what the scene shows is lost: local correlation of luminance, blind to colour, not to the sign.
 
-    mean over levels and windows of  w (1 - cov(y, t) / sqrt(var y var t)),   w = var t / (var t + 1e-3)
+    mean over levels and windows of  w (1 - cov(y, t) / sqrt(var y var t)),   w = var t / (var t + flat)
 
     A negative scores up to twice as high as a picture that shows nothing. Coarse levels leave room for strokes, and
     with `whole` what is bright stays brighter than what is dark, strokes and all.
 
     Args:      picture, scene: (B,3,H,W).  levels: factors by which both are averaged first.  window: side [pixels].
                whole: count the whole picture, at full size and as one window, as one level more.
+               flat: local variance of luminance below which the scene's contents count less.
     """
     y, t = (x - x.mean((-2, -1), keepdim=True) for x in (luminance(picture), luminance(scene)))  # for rounding alone
     losses = []
     for level in levels:
         coarse = F.avg_pool2d(y, level), F.avg_pool2d(t, level)
         side = min(window, *coarse[0].shape[-2:])
-        losses.append(_lost(*coarse, (side, side)))
+        losses.append(_lost(*coarse, (side, side), flat))
     if whole:
-        losses.append(_lost(y, t, y.shape[-2:]))
+        losses.append(_lost(y, t, y.shape[-2:], flat))
     return torch.stack(losses).mean()
 
 
-def _lost(y: Tensor, t: Tensor, side: tuple[int, ...]) -> Tensor:
+def _lost(y: Tensor, t: Tensor, side: tuple[int, ...], flat: float) -> Tensor:
     """One level of `correlation_loss`, in windows of some rows and columns."""
     mean_y, mean_t, square_y, square_t, product = F.avg_pool2d(
         torch.cat([y, t, y * y, t * t, y * t], dim=1), side, stride=1
@@ -176,7 +182,7 @@ def _lost(y: Tensor, t: Tensor, side: tuple[int, ...]) -> Tensor:
     var_y = (square_y - mean_y**2).clamp(min=0) + 1e-5
     var_t = (square_t - mean_t**2).clamp(min=0)
     correlation = (product - mean_y * mean_t) / (var_y * (var_t + 1e-5)).sqrt()
-    return (var_t / (var_t + FLAT) * (1 - correlation)).mean()
+    return (var_t / (var_t + flat) * (1 - correlation)).mean()
 
 
 # ---- all together -------------------------------------------------------------------------------------------------
@@ -198,7 +204,7 @@ class StyleLoss(nn.Module):
         statistic: "moments" (`moment_loss`) or "gram" (eq. 3.12), the mean and the sum over the layers.
         content_by: "correlation" (`correlation_loss`), or "features": eq. 3.10 at the layer `content_layer`.
         style, colour, content, l2, tv: weights; a term of weight 0 is not computed.
-        levels, window, whole: of the correlation.
+        levels, window, whole, flat: of the correlation.
         content_layer: of the features, where content_by is "features".
         crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
     Raises:    ValueError for an unknown name, weights that are negative or all 0, or a style that is too small;
@@ -224,6 +230,7 @@ class StyleLoss(nn.Module):
         levels: tuple[int, ...] = (1, 2, 4),
         window: int = 11,
         whole: bool = False,
+        flat: float = 1e-3,
         content_layer: str = "relu3_3",
         crop: int | None = None,
     ) -> None:
@@ -241,9 +248,11 @@ class StyleLoss(nn.Module):
             raise ValueError(f"levels must be whole numbers of at least 1, got {levels!r}. Use levels=(1, 2, 4).")
         if window < 2:
             raise ValueError(f"window must be at least 2 pixels, got {window!r}. Use window=11.")
+        if not 0 < flat < math.inf:
+            raise ValueError(f"flat must be a finite variance > 0, got {flat!r}. Use flat=1e-3.")
         self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
-        self.levels, self.window, self.whole = tuple(levels), window, whole
+        self.levels, self.window, self.whole, self.flat = tuple(levels), window, whole, flat
         self.content_layer = content_layer
         crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
         self.crop = crops.shape[-1]
@@ -323,6 +332,11 @@ class StyleLoss(nn.Module):
         """The sum of the terms, 0-d. Arguments: as `terms`."""
         return torch.stack(list(self.terms(picture, scene).values())).sum()
 
+    @property
+    def correlation(self) -> dict[str, Any]:
+        """How `correlation_loss` measures here."""
+        return {"levels": self.levels, "window": self.window, "whole": self.whole, "flat": self.flat}
+
     def _style(self, layers: dict[str, Tensor]) -> Tensor:
         losses = []
         for name, target in self.targets.items():
@@ -338,7 +352,7 @@ class StyleLoss(nn.Module):
 
     def _content(self, picture: Tensor, scene: Tensor, layers: dict[str, Tensor]) -> Tensor:
         if self.content_by == "correlation":
-            return correlation_loss(picture, scene, levels=self.levels, window=self.window, whole=self.whole)
+            return correlation_loss(picture, scene, **self.correlation)
         with torch.no_grad():
             target = self.features(scene)[self.content_layer]
         return content_loss(layers[self.content_layer], target)

@@ -254,7 +254,7 @@ class Run:
             "settings": {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()},
             "style": style,
             "loss": {"weights": loss.weights, "statistic": loss.statistic, "content_by": loss.content_by},
-            "correlation": {"levels": list(loss.levels), "window": loss.window, "whole": loss.whole},
+            "correlation": loss.correlation | {"levels": list(loss.levels)},
             "features": [loss.features.name, loss.content_layer],
             "source": [type(self.source).__name__, len(self.source)],
             "parameters": {name: list(p.shape) for name, p in self.named.items()},

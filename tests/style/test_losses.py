@@ -276,8 +276,9 @@ def test_luminance_is_rec_709():
     assert (luminance(picture)[:, 0] - expected).abs().max() < 1e-7
 
 
+@pytest.mark.parametrize("flat", [1e-3, 3e-4, 0.1])
 @pytest.mark.parametrize(("level", "shape"), [(1, (16, 20)), (2, (32, 40)), (4, (32, 36))])
-def test_correlation_by_its_equation(level: int, shape: tuple[int, int]):
+def test_correlation_by_its_equation(level: int, shape: tuple[int, int], flat: float):
     picture, scene = noise(2, 3, *shape), noise(2, 3, *shape, seed=1)
     weights = np.array([0.2126, 0.7152, 0.0722])
     planes = []
@@ -289,9 +290,10 @@ def test_correlation_by_its_equation(level: int, shape: tuple[int, int]):
         planes.append(windows.reshape(*windows.shape[:3], -1))
     y, t = planes
     covariance = (y * t).mean(-1) - y.mean(-1) * t.mean(-1)
-    weight = t.var(-1) / (t.var(-1) + 1e-3)
+    weight = t.var(-1) / (t.var(-1) + flat)
     expected = np.mean(weight * (1 - covariance / np.sqrt((y.var(-1) + 1e-5) * (t.var(-1) + 1e-5))))
-    assert correlation_loss(picture, scene, levels=(level,)).item() == pytest.approx(expected, rel=1e-5)
+    assert correlation_loss(picture, scene, levels=(level,), flat=flat).item() == pytest.approx(expected, rel=1e-5)
+    assert flat != 1e-3 or correlation_loss(picture, scene, levels=(level,)).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_whole_picture_is_a_level_more():
@@ -461,6 +463,8 @@ def test_wrong_styles(picture: Any, error: type[Exception], message: str):
         ({"style": 0, "colour": 0, "content": 0}, "all weights are 0: no term is left. Give one, such as style=1."),
         ({"levels": ()}, "levels must be whole numbers of at least 1, got (). Use levels=(1, 2, 4)."),
         ({"levels": (0, 1)}, "levels must be whole numbers of at least 1, got (0, 1)."),
+        ({"flat": 0.0}, "flat must be a finite variance > 0, got 0.0. Use flat=1e-3."),
+        ({"flat": math.nan}, "flat must be a finite variance > 0, got nan."),
         ({"crop": 48}, "crops of 48 pixels are too small: the features need at least 64. Use crop=64."),
         ({"crop": 0}, "crops of 0 pixels are too small"),
     ],
