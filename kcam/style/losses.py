@@ -252,7 +252,7 @@ class StyleLoss(nn.Module):
             raise ValueError(f"flat must be a finite variance > 0, got {flat!r}. Use flat=1e-3.")
         self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
-        self.levels, self.window, self.whole, self.flat = tuple(levels), window, whole, flat
+        self.correlation: dict[str, Any] = {"levels": tuple(levels), "window": window, "whole": whole, "flat": flat}
         self.content_layer = content_layer
         crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
         self.crop = crops.shape[-1]
@@ -331,11 +331,6 @@ class StyleLoss(nn.Module):
     def forward(self, picture: Tensor, scene: Tensor | None = None) -> Tensor:
         """The sum of the terms, 0-d. Arguments: as `terms`."""
         return torch.stack(list(self.terms(picture, scene).values())).sum()
-
-    @property
-    def correlation(self) -> dict[str, Any]:
-        """How `correlation_loss` measures here."""
-        return {"levels": self.levels, "window": self.window, "whole": self.whole, "flat": self.flat}
 
     def _style(self, layers: dict[str, Tensor]) -> Tensor:
         losses = []

@@ -249,12 +249,12 @@ class Run:
         """What must be the same for a run to go on."""
         quantiles = self.loss.quantiles.detach().cpu().numpy()
         style = hashlib.sha256(quantiles.tobytes()).hexdigest()[:16]
-        settings, loss = dataclasses.asdict(self.settings), self.loss
+        loss = self.loss
         return {
-            "settings": {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()},
+            "settings": _as_in_json(dataclasses.asdict(self.settings)),
             "style": style,
             "loss": {"weights": loss.weights, "statistic": loss.statistic, "content_by": loss.content_by},
-            "correlation": loss.correlation | {"levels": list(loss.levels)},
+            "correlation": _as_in_json(loss.correlation),
             "features": [loss.features.name, loss.content_layer],
             "source": [type(self.source).__name__, len(self.source)],
             "parameters": {name: list(p.shape) for name, p in self.named.items()},
@@ -355,6 +355,11 @@ class _Clock:
 
     def total(self) -> float:
         return time.perf_counter() - self._began
+
+
+def _as_in_json(values: dict[str, Any]) -> dict[str, Any]:
+    """With lists for tuples, as they come back."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def _difference(key: str, there: Any, here: Any) -> str:
