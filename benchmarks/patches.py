@@ -229,8 +229,7 @@ def extraction(folder: Path, size: Size) -> list[dict[str, Any]]:
             rates["extract"].append(written / one / 1e6)
             rates["copy"].append(written / two / 1e6)
     return [
-        {"what": what, "bytes": written} | spread(own, rates["extract"], "MB_per_second")
-        for what, own in rates.items()
+        {"what": what, "bytes": written} | spread(own, rates["extract"], "MB_per_second") for what, own in rates.items()
     ]
 
 

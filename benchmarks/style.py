@@ -1,6 +1,7 @@
 """What each part of a camera brings to a style, and why the thesis's arrangement fails: trained and measured.
 
     python -m benchmarks.style [--styles strokes,..] [--arms optics,..] [--work .style-bench]     train and measure
+    python -m benchmarks.style --styles strokes --arms stage --seeds 1,2                        again, by other seeds
     python -m benchmarks.style --collect                                                        write what is committed
     python -m benchmarks.style --paint                                                          docs/painted.jpg
 
@@ -13,6 +14,7 @@ that two processes can share them.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 import warnings
@@ -176,19 +178,20 @@ def gaps(pictures: dict[str, Tensor], *, style: str) -> dict[str, Any]:
     return {"photographs": rows, "mean": mean, "wallpaper": measures.wallpaper(list(pictures.values()))}
 
 
-def run(style: str, name: str, work: Path) -> dict[str, Any]:
+def run(style: str, name: str, work: Path, *, seed: int = 0) -> dict[str, Any]:
     """Train an arm, write its pictures, and measure."""
     arm = ARMS[name]
+    settings = replace(arm.settings, seed=seed)
     own, _ = halves(style)
     camera = arm.camera()
-    loss = StyleLoss(own, crop=arm.settings.size, **arm.loss)
+    loss = StyleLoss(own, crop=settings.size, **arm.loss)
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        trained = fit(camera, loss, settings=arm.settings)
+        trained = fit(camera, loss, settings=settings)
     seconds = time.perf_counter() - began
     pictures = shots(camera)
-    folder = folder_of(style, name, work)
+    folder = folder_of(style, name, work, seed=seed)
     folder.mkdir(parents=True, exist_ok=True)
     for title, picture in pictures.items():
         plots.write_picture(picture, folder / f"{title}.png")
@@ -196,7 +199,8 @@ def run(style: str, name: str, work: Path) -> dict[str, Any]:
         "style": style,
         "arm": name,
         "note": arm.note,
-        "steps": arm.settings.steps,
+        "seed": seed,
+        "steps": settings.steps,
         "seconds": seconds,
         "threads": torch.get_num_threads(),
         "loss_at_end": float(trained.history[-20:, 0].mean()),
@@ -210,6 +214,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--styles", default=",".join(STYLES))
     parser.add_argument("--arms", default=";".join(ARMS), help="separated by semicolons")
+    parser.add_argument("--seeds", default="0", help="of the training; 0 is what the tables and pictures show")
     parser.add_argument("--work", type=Path, default=WORK)
     parser.add_argument("--collect", action="store_true")
     parser.add_argument("--paint", action="store_true")
@@ -220,23 +225,24 @@ def main() -> None:
     if arguments.paint:
         paint_pictures()
         return
-    for style in arguments.styles.split(","):
-        for name in arguments.arms.split(";"):
-            if style in ARMS[name].styles:
-                row = run(style, name, arguments.work)
-                mean = {key: round(value, 2) for key, value in row["mean"].items()}
-                print(style, name, f"{row['seconds']:.0f} s", mean, flush=True)
+    seeds = [int(seed) for seed in arguments.seeds.split(",")]
+    for style, name, seed in itertools.product(arguments.styles.split(","), arguments.arms.split(";"), seeds):
+        if style in ARMS[name].styles:
+            row = run(style, name, arguments.work, seed=seed)
+            mean = {key: round(value, 2) for key, value in row["mean"].items()}
+            print(style, name, seed, f"{row['seconds']:.0f} s", mean, flush=True)
 
 
-def folder_of(style: str, name: str, work: Path) -> Path:
-    return work / f"{style}-{name}".replace(", ", "-").replace(" ", "-")
+def folder_of(style: str, name: str, work: Path, *, seed: int = 0) -> Path:
+    again = f"-seed{seed}" if seed else ""
+    return work / (f"{style}-{name}".replace(", ", "-").replace(" ", "-") + again)
 
 
 def collect(work: Path) -> None:
     """Runs in the work folder to the committed results and pictures."""
     rows = [json.loads(path.read_text()) for path in sorted(work.glob("*/result.json"))]
     order = {name: index for index, name in enumerate(ARMS)}
-    rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]]))
+    rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]], row["seed"]))
     write_json(RESULT, {"environment": environment(), "rows": rows})
 
     def shot(style: str, name: str, photograph: str) -> Tensor:
@@ -252,10 +258,7 @@ def collect(work: Path) -> None:
             labels=[f"kcam train {style}" for style in STYLES],
         ),
         "style-parts": plots.contact_sheet(
-            [
-                [ordinary[hopper], *(shot(style, part, hopper) for part in OURS)]
-                for style in STYLES
-            ],
+            [[ordinary[hopper], *(shot(style, part, hopper) for part in OURS)] for style in STYLES],
             titles=["Ordinary camera", "DOE alone", "+ colour filter", "+ 3x3 and tone", "+ style stage"],
             labels=list(STYLES),
         ),

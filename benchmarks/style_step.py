@@ -394,10 +394,7 @@ class Bench:
                 contestant(DOUBLE_POINTS, lambda: double(self.scene), dtype="complex128"),
                 contestant(SPARED_PIXELS, lambda: pixels(self.scene), dtype="complex64", once=True),
                 contestant("kcam", lambda: kcam_picture(camera, self.scene), default=True),
-                *(
-                    contestant(who, lambda own=own: kcam_picture(own, self.scene))
-                    for who, own in self.planned.items()
-                ),
+                *(contestant(who, lambda own=own: kcam_picture(own, self.scene)) for who, own in self.planned.items()),
             ],
             seconds=self.sizes.seconds,
             most_rounds=3,

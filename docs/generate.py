@@ -619,39 +619,32 @@ STYLE_MEASURES = {
 }
 
 
-def style_rows(name: str) -> list[dict[str, Any]]:
-    """The runs of the thesis's arrangement and its repairs, or of ours."""
+def style_rows(which: str) -> list[dict[str, Any]]:
+    """The runs of the thesis's arrangement and its repairs, of ours, or of the arms that ran by several seeds."""
     rows = json.loads((RESULTS / "style.json").read_text())["rows"]
-    return [row for row in rows if row["arm"].startswith("thesis") == (name == "thesis")]
+    if which == "seeds":
+        again = {(row["style"], row["arm"]) for row in rows if row["seed"]}
+        return [row for row in rows if (row["style"], row["arm"]) in again]
+    return [row for row in rows if not row["seed"] and row["arm"].startswith("thesis") == (which == "thesis")]
 
 
-def style_line(row: dict[str, Any]) -> str:
-    """The measures of a run, as cells."""
-    mean = row["mean"]
-    gaps = (f"{100 * mean[key]:.0f} %" for key in list(STYLE_MEASURES)[:3])
-    correlations = (f"{mean[key]:.2f}" for key in list(STYLE_MEASURES)[3:])
-    return " | ".join((*gaps, *correlations, f"{row['wallpaper']:.2f}", f"{row['seconds']:.0f} s"))
-
-
-def style_table() -> str:
-    """What each part of the camera brings, for each style."""
-    head = f"| style | what trains | {' | '.join(STYLE_MEASURES.values())} | wallpaper | time |"
-    lines = [head, "|---" * 9 + "|"]
-    lines += [f"| {row['style']} | {row['note']} | {style_line(row)} |" for row in style_rows("ours")]
-    return "\n".join(lines)
-
-
-def thesis_table() -> str:
-    """The thesis's arrangement, and what each of our changes repairs."""
-    head = f"| arrangement | style | {' | '.join(STYLE_MEASURES.values())} | wallpaper | time |"
-    lines = [head, "|---" * 9 + "|"]
-    lines += [f"| {row['note']} | {row['style']} | {style_line(row)} |" for row in style_rows("thesis")]
-    return "\n".join(lines)
+def style_table(which: str, **columns: str) -> str:
+    """The measures of runs, behind what columns (a row's key: its title) say of them."""
+    lines = [" | ".join((*columns.values(), *STYLE_MEASURES.values(), "wallpaper", "time"))]
+    for row in style_rows(which):
+        mean = row["mean"]
+        told = (str(row[key]) for key in columns)
+        gaps = (f"{100 * mean[key]:.0f} %" for key in list(STYLE_MEASURES)[:3])
+        correlations = (f"{mean[key]:.2f}" for key in list(STYLE_MEASURES)[3:])
+        lines.append(" | ".join((*told, *gaps, *correlations, f"{row['wallpaper']:.2f}", f"{row['seconds']:.0f} s")))
+    head, *runs = (f"| {line} |" for line in lines)
+    return "\n".join((head, "|---" * (len(columns) + len(STYLE_MEASURES) + 2) + "|", *runs))
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "style": style_table,
-    "thesis": thesis_table,
+    "style": lambda: style_table("ours", style="style", note="what trains"),
+    "seeds": lambda: style_table("seeds", style="style", seed="seed"),
+    "thesis": lambda: style_table("thesis", note="arrangement", style="style"),
     "propagators": propagators_table,
     "tradeoff": tradeoff_table,
     "traps": traps_table,
