@@ -53,12 +53,13 @@ bench: $(VENV)/dev.stamp
 bench-augmentation: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.augmentation
 
-# One step at the thesis's sizes: ten minutes. Four styles and all arms, trained and measured: an hour.
+# One step at the thesis's sizes: ten minutes. Four styles and all arms, trained and measured: half an hour.
 bench-style: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style_step
 
 bench-styles: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style --styles strokes --arms stage --seeds 1,2
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style --collect
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.style --paint
 
