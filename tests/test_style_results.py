@@ -51,6 +51,15 @@ def test_what_docs_say_of_the_aims(style: str) -> None:
     assert all(round(photo["luminance_correlation"], 2) >= 0.6 for photo in row["photographs"].values())
 
 
+def test_what_docs_say_of_seeds() -> None:
+    for row in AGAIN:
+        missed = {name for name, aim in AIMS.items() if row["mean"][name] < aim}
+        assert missed == ({"oriented_texture"} if row["seed"] == 1 else set())
+        assert row["mean"]["oriented_texture"] >= 0.535
+        for name in ("luminance_correlation", "detail_correlation"):
+            assert all(round(photo[name], 2) >= 0.6 for photo in row["photographs"].values())
+
+
 @pytest.mark.parametrize("style", STYLES)
 def test_no_shot_is_a_wallpaper(style: str) -> None:
     row = next(row for row in ROWS if (row["style"], row["arm"]) == (style, "stage"))
