@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,8 +17,8 @@ ROWS = [row for row in ALL if row["seed"] == 0]
 AGAIN = [row for row in ALL if row["seed"]]
 
 
-def mean(style: str, arm: str) -> dict[str, float]:
-    return next(row for row in ROWS if (row["style"], row["arm"]) == (style, arm))["mean"]
+def committed(style: str, arm: str) -> dict[str, Any]:
+    return next(row for row in ROWS if (row["style"], row["arm"]) == (style, arm))
 
 
 def test_every_arm_was_run_for_each_of_its_styles() -> None:
@@ -31,7 +32,7 @@ def test_every_arm_was_run_for_each_of_its_styles() -> None:
 
 @pytest.mark.parametrize("style", STYLES)
 def test_a_camera_alone_brings_colour_and_no_strokes(style: str) -> None:
-    camera, stage = mean(style, "convolution"), mean(style, "stage")
+    camera, stage = (committed(style, arm)["mean"] for arm in ("convolution", "stage"))
     assert camera["oriented_texture"] < 0.15
     assert stage["oriented_texture"] > camera["oriented_texture"] + 0.2
     assert stage["training_loss"] > camera["training_loss"] + 0.2
@@ -41,29 +42,28 @@ def test_a_camera_alone_brings_colour_and_no_strokes(style: str) -> None:
 AIMS = {"training_loss": 0.9, "patch_swd": 0.85, "oriented_texture": 0.55}
 
 
+def check_aims(row: dict[str, Any], *, missed: set[str]) -> None:
+    """Of the gaps closed, the mean misses these alone; what is left of the scene is enough on each photograph."""
+    assert {name for name, aim in AIMS.items() if row["mean"][name] < aim} == missed
+    for name in ("luminance_correlation", "detail_correlation"):
+        assert all(photo[name] >= 0.6 for photo in row["photographs"].values())
+
+
 @pytest.mark.parametrize("style", STYLES)
 def test_what_docs_say_of_the_aims(style: str) -> None:
-    found = mean(style, "stage")
-    missed = {name for name, aim in AIMS.items() if found[name] < aim}
-    assert missed == ({"training_loss", "patch_swd"} if style == "woodcut" else set())
-    assert min(found["luminance_correlation"], found["detail_correlation"]) >= 0.6
-    row = next(row for row in ROWS if (row["style"], row["arm"]) == (style, "stage"))
-    assert all(round(photo["luminance_correlation"], 2) >= 0.6 for photo in row["photographs"].values())
+    missed = {"training_loss", "patch_swd"} if style == "woodcut" else set()
+    check_aims(committed(style, "stage"), missed=missed)
 
 
 def test_what_docs_say_of_seeds() -> None:
     for row in AGAIN:
-        missed = {name for name, aim in AIMS.items() if row["mean"][name] < aim}
-        assert missed == ({"oriented_texture"} if row["seed"] == 1 else set())
-        assert row["mean"]["oriented_texture"] >= 0.535
-        for name in ("luminance_correlation", "detail_correlation"):
-            assert all(round(photo[name], 2) >= 0.6 for photo in row["photographs"].values())
+        check_aims(row, missed={"oriented_texture"} if row["seed"] == 1 else set())
+        assert row["mean"]["oriented_texture"] >= 0.535  # "by 1 %"
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_no_shot_is_a_wallpaper(style: str) -> None:
-    row = next(row for row in ROWS if (row["style"], row["arm"]) == (style, "stage"))
-    assert row["wallpaper"] < 0.45
+    assert committed(style, "stage")["wallpaper"] < 0.45
 
 
 @pytest.mark.parametrize("name", ["style", "style-parts", "style-thesis", "painted"])
