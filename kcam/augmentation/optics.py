@@ -20,6 +20,7 @@ DESIGN = 550 * nm
 FOCAL_LENGTH, PIXEL_PITCH = 8 * mm, 4 * um
 """Of a machine-vision camera; a phone has 4.3 mm and 1.4 um, a full-frame camera 50 mm and 6 um."""
 FOCAL_LENGTH_RANGE = (1e-4, 10.0)
+_PLANES_IN_CACHE = 4  # that are convolved at once
 
 
 class RandomBlur(CameraAugmentation):
@@ -96,7 +97,7 @@ def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
     planes, kernels = signal.flatten(0, 1)[:, None], psfs.flatten(0, 1)[:, None]
     # few planes at once stay in a CPU's cache: three times as fast on 28 bands; a GPU wants many
     split = signal.device.type == "cpu" and not torch.compiler.is_compiling()
-    at_once = sizes.bands if split else len(planes)
+    at_once = _PLANES_IN_CACHE if split else len(planes)
     parts = [
         sizes.back(sizes.transform(some) * sizes.transfer(their))
         for some, their in zip(planes.split(at_once), kernels.split(at_once), strict=True)

@@ -27,7 +27,9 @@ BORDERS = ("reflect", "replicate", "periodic", "zero")
 _CACHED = 2**20  # pixels beyond which a plane is no longer near the processor
 _UNFOLDED = 2**25  # bytes of a strip that is convolved directly
 _PIXELS_IN_CACHE = 2**16  # of planes that are transformed at once
-_BANDS_AT_ONCE = 4  # at most, in the buffer of a contraction: small enough to stay in the processor's cache
+_STRIP = 2**17  # values of a strip of columns of half spectra
+_LINE = 8  # complex numbers that lie in one line of a processor's cache
+_ALL = slice(None)
 
 
 class Renderer:
@@ -278,7 +280,7 @@ def rendering_work(
         else:
             inputs, kernels = (planes if factored else bands), bands
             products = bands * (1 + channels + (planes if factored else 0))
-            held = inputs + 2 * sizes.bands + 2 * channels
+            held = (planes if factored else min(bands, sizes.bands)) + min(bands, sizes.bands) + 2 * channels
     if direct:
         summed = products + (2 * out if coverage else 0)
         touched = (inputs + 2 * out) * pixels + mixed
@@ -309,7 +311,7 @@ class Convolution:
     window: tuple[int, int]
     border: str  # one of BORDERS, or "given": the planes come with what lies around them
     size: tuple[int, int]
-    bands: int  # at once
+    bands: int  # at once, of one picture
     held: int  # planes whose spectra may wait for the backward pass
 
     @classmethod
@@ -323,9 +325,9 @@ class Convolution:
         max_memory: float,
         layers: int = 1,
     ) -> Convolution:
-        """Fast lengths for a picture and a window, and as many bands at once as are fast and fit.
+        """Fast lengths for a picture and a window, and as many bands at once as fit into a quarter of the memory.
 
-        layers: of depth, which share a quarter of the memory for spectra that are held. Tiles are many and hold none.
+        layers: of depth, which share another quarter for what is held. Tiles are many and hold none.
         """
         after = border != "zero"  # zeros may share their place with those before the picture
         rows, columns = (
@@ -333,62 +335,110 @@ class Convolution:
         )
         quarter = int(max_memory // (4 * rows * columns * itemsize))
         held = 0 if border == "given" else quarter // layers
-        return cls(picture, window, border, (rows, columns), max(1, min(_BANDS_AT_ONCE, quarter)), held)
+        return cls(picture, window, border, (rows, columns), max(1, quarter), held)
+
+    def parts(self, count: int, batch: int) -> list[slice]:
+        """So many bands of so many pictures, as many at once as there is room for."""
+        step = max(1, self.bands // (batch + 1))
+        return [slice(start, min(start + step, count)) for start in range(0, count, step)]
+
+    def strips(self, like: Tensor, count: int) -> list[slice]:
+        """Columns of so many half spectra: on a CPU as many at once as stay in its cache."""
+        columns = self.size[1] // 2 + 1
+        whole = like.device.type != "cpu" or torch.compiler.is_compiling()  # compiled, each would be traced by itself
+        step = columns if whole else max(_LINE, _STRIP // (count * self.size[0]))
+        return [slice(start, min(start + step, columns)) for start in range(0, columns, step)]
 
     def transform(self, planes: Tensor) -> Tensor:
-        """Spectrum of planes (..., H, W) with their border."""
-        return _in_cache(self._transform, planes)
+        """Half spectra of planes (..., H, W) with their border."""
+        return _in_cache(lambda part: self.columns(self._rows(part)), planes)
 
-    def _transform(self, planes: Tensor) -> Tensor:
-        (rows, columns), (length, width) = self.window, self.size
-        # a row of the border repeats a row of the picture, and so does its transform: each is computed once
-        along_x = torch.fft.rfft(self._extend(planes, columns, dim=-1), n=width)
-        return torch.fft.fft(self._extend(along_x, rows, dim=-2), n=length, dim=-2)
+    def rows(self, planes: Tensor) -> Tensor:
+        """Half spectra of the rows of planes (..., H, W) with their border."""
+        return _in_cache(self._rows, planes)
 
-    def _extend(self, planes: Tensor, window: int, *, dim: int) -> Tensor:
+    def _rows(self, planes: Tensor) -> Tensor:
+        return torch.fft.rfft(self._extend(planes, dim=-1), n=self.size[1])
+
+    def columns(self, rows: Tensor, strip: slice = _ALL) -> Tensor:
+        """Spectra of a strip of columns. A row of the border repeats one of the picture: it was transformed once."""
+        return torch.fft.fft(self._extend(rows[..., strip], dim=-2).mT, n=self.size[0])
+
+    def _extend(self, planes: Tensor, *, dim: int) -> Tensor:
+        """The border on both sides. A mirror, a seam or an edge goes on up to the transform's length: no pixel that is
+        kept sees so far, and zeros would be one more copy.
+        """
         if self.border == "given":
             return planes
-        return extend_along(planes, window, self.border, dim=dim)  # zeros beyond the size are cut off there
+        return extend_along(planes, self.window[dim], self.border, dim=dim, length=self.size[dim])
+
+    def rows_adjoint(self, rows: Tensor) -> Tensor:
+        """Gradient to planes (..., H, W), from `columns_adjoint`."""
+        return _in_cache(lambda part: self._fold(torch.fft.irfft(part, n=self.size[1]), dim=-1), rows)
+
+    def columns_adjoint(self, conjugate: Tensor) -> Tensor:
+        """What becomes the gradient to planes, from the conjugate of that to spectra times the number of points."""
+        return self._fold(torch.fft.ifft(conjugate.conj()).mT, dim=-2)
+
+    def _fold(self, extended: Tensor, *, dim: int) -> Tensor:
+        """Transpose of `_extend`, and of the zeros up to the transform's length."""
+        n, m = self.picture[dim], self.window[dim]
+        before, after = m // 2, (m - 1) // 2
+        if self.border == "zero":
+            return extended.narrow(dim, before, n)
+        extended = extended.narrow(dim, 0, n + before + after)
+        if self.border == "given":
+            return extended
+        index = _border_index(torch.arange(-before, n + after, device=extended.device), n, self.border)
+        shape = list(extended.shape)
+        shape[dim] = n
+        return extended.new_zeros(shape).index_add_(dim, index, extended)
 
     def transfer(self, kernels: Tensor) -> Tensor:
         """Conjugate transfer functions of kernels (..., h, w)."""
-        along_x = torch.fft.rfft(kernels, n=self.size[1])  # only the kernel's own rows, before the zero rows
-        # conjugated in memory: a lazy conjugate would be copied at every product
-        return torch.fft.fft(along_x, n=self.size[0], dim=-2).conj_physical_()
+        return _in_cache(lambda part: self.conjugate_columns(self._conjugate_rows(part)), kernels)
 
-    def transfer_adjoint(self, d_transfer: Tensor) -> Tensor:
-        """Gradient to the kernels (..., h, w), from that to their transfer functions times the number of points."""
-        # only the rows that a kernel has go on to the second transform
-        rows = torch.fft.ifft(d_transfer, dim=-2)[..., : self.window[0], :]
-        return torch.fft.irfft(rows, n=self.size[1])[..., : self.window[1]]
+    def conjugate_rows(self, planes: Tensor) -> Tensor:
+        """Conjugate half spectra of the rows of planes (..., h, w) with nothing around them."""
+        return _in_cache(self._conjugate_rows, planes)
 
-    @property
-    def points(self) -> int:
-        """Of a half spectrum."""
-        return self.size[0] * (self.size[1] // 2 + 1)
+    def _conjugate_rows(self, planes: Tensor) -> Tensor:
+        # in memory: a lazy conjugate would be copied at every product
+        return torch.fft.rfft(planes, n=self.size[1]).conj_physical_()
 
-    def buffer(self, like: Tensor) -> Tensor:
-        """Room for the half spectra of as many bands as are computed at once, real and imaginary part last."""
-        return like.new_empty(self.bands, self.size[0], self.size[1] // 2 + 1, 2)
-
-    def parts(self, count: int) -> list[range]:
-        """So many bands, as many at once as there is room for."""
-        return [range(start, min(start + self.bands, count)) for start in range(0, count, self.bands)]
+    def conjugate_columns(self, rows: Tensor, strip: slice = _ALL) -> Tensor:
+        """Conjugate spectra of a strip of columns."""
+        return torch.fft.ifft(rows[..., strip].mT, n=self.size[0], norm="forward")
 
     def back(self, spectrum: Tensor) -> Tensor:
-        """The picture of a spectrum."""
-        return _in_cache(self._back, spectrum)
+        """The picture of a half spectrum."""
+        height, width = self.picture
+        return _in_cache(lambda part: self._back_rows(self.back_columns(part, height), width), spectrum)
 
-    def _back(self, spectrum: Tensor) -> Tensor:
-        rows = torch.fft.ifft(spectrum, dim=-2)[..., : self.picture[0], :]  # no others go on to the second transform
-        return torch.fft.irfft(rows, n=self.size[1])[..., : self.picture[1]]
+    def back_columns(self, spectra: Tensor, height: int) -> Tensor:
+        """The first `height` rows of a strip of columns; no others go on to the second transform."""
+        return torch.fft.ifft(spectra)[..., :height].mT
 
-    def back_adjoint(self, pictures: Tensor) -> Tensor:
-        """Spectrum of a picture with nothing around it, half of the transpose of `back`: the other half is implied."""
-        return _in_cache(self._back_adjoint, pictures)
+    def back_rows(self, rows: Tensor, width: int) -> Tensor:
+        """The first `width` pixels of each row."""
+        return _in_cache(lambda part: self._back_rows(part, width), rows)
 
-    def _back_adjoint(self, pictures: Tensor) -> Tensor:
-        return torch.fft.fft(torch.fft.rfft(pictures, n=self.size[1]), n=self.size[0], dim=-2)
+    def _back_rows(self, rows: Tensor, width: int) -> Tensor:
+        return torch.fft.irfft(rows, n=self.size[1])[..., :width]
+
+    def room(self, like: Tensor, *shape: int) -> Tensor:
+        """For the half spectra of rows (*shape, F)."""
+        return torch.view_as_complex(like.new_empty(*shape, self.size[1] // 2 + 1, 2))
+
+    def inner(self, conjugate: Tensor, spectra: Tensor, strip: slice) -> Tensor:
+        """What strips (M, F, rows) and (K, F, rows) add to the inner products (M, K) of real planes, by Parseval."""
+        counted = conjugate.real.new_full((self.size[1] // 2 + 1, 1, 2), 2.0)  # the other half is implied
+        counted[0] = 1.0
+        if self.size[1] % 2 == 0:
+            counted[-1] = 1.0
+        counted[..., 1].neg_()
+        counted /= self.size[0] * self.size[1]
+        return (torch.view_as_real(conjugate) * counted[strip]).flatten(1) @ torch.view_as_real(spectra).flatten(1).T
 
 
 def _in_cache(function: Callable[[Tensor], Tensor], planes: Tensor) -> Tensor:
@@ -400,134 +450,148 @@ def _in_cache(function: Callable[[Tensor], Tensor], planes: Tensor) -> Tensor:
     few = planes.shape[:-2].numel() <= at_once
     if few or planes.device.type != "cpu" or torch.compiler.is_compiling():  # compiled, each would be traced by itself
         return function(planes)
-    parts = [function(part) for part in planes.flatten(0, -3).split(at_once)]
-    return torch.cat(parts).unflatten(0, planes.shape[:-2])
+    parts = planes.flatten(0, -3).split(at_once)
+    if planes.requires_grad and torch.is_grad_enabled():
+        return torch.cat([function(part) for part in parts]).unflatten(0, planes.shape[:-2])
+    first = function(parts[0])
+    out = first.new_empty(planes.shape[:-2].numel(), *first.shape[1:])
+    for place, part in zip(out.split(at_once), parts, strict=True):  # each is copied while it is near
+        place.copy_(first if part is parts[0] else function(part))
+    return out.unflatten(0, planes.shape[:-2])
 
 
 class Contraction(torch.autograd.Function):
-    """sum_l kappa_cl H_l (sum_k S_kl C_k), a few bands at a time in one small buffer.
+    """sum_l kappa_cl H_l (sum_k S_kl C_k), strip by strip of the spectra's columns.
 
-    All bands at once would take hundreds of megabytes, and most of the time would go into touching them first. What a
-    batch shares, a band's transfer function and the way back of its gradient, is computed once for all its pictures.
-    The bands' spectra are held for the backward pass where all layers' together take no more than a quarter of the
-    memory.
+    Rows are transformed first, of all bands that fit into memory. What then becomes of a strip of columns, from their
+    transform to the transform back, stays in the processor's cache: whole spectra of all bands would be written to far
+    memory and read again at every step. What a batch shares, a band's transfer function and the way back of its
+    gradient, is computed once for all its pictures. The spectra of the planes are held for the backward pass where all
+    layers' together take no more than a quarter of the memory.
     """
 
     @staticmethod
     def forward(ctx, planes, psfs, spectra, weights, kept, convolution):
-        channels = weights.shape[0]
-        factors = None if spectra is None else convolution.transform(planes)
+        height, width = convolution.picture
+        parts = convolution.parts(len(psfs), len(planes))
+        spectra_of_all = planes[:, :, 0, 0].numel() * (1 if spectra is None else len(parts))
+        hold = any(ctx.needs_input_grad[1:4]) and spectra_of_all <= convolution.held
         held = []
-        of_use = spectra is None and (ctx.needs_input_grad[1] or ctx.needs_input_grad[3])
-        hold = of_use and planes[:, :, 0, 0].numel() <= convolution.held
-        totals = planes.new_zeros(planes.shape[0], channels, 2 * convolution.points)
-        buffer = convolution.buffer(planes)
-        for part in convolution.parts(psfs.shape[0]):
-            transfers = [_band_transfer(convolution, psfs, kept, index) for index in part]
-            for b, total in enumerate(totals):
-                for slot, (index, transfer) in enumerate(zip(part, transfers, strict=True)):
-                    spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
-                    if hold:
-                        held.append(spectrum)
-                    torch.mul(spectrum, transfer, out=torch.view_as_complex(buffer[slot]))
-                total.addmm_(weights[:, part.start : part.stop], buffer[: len(part)].flatten(1))
+        result = convolution.room(planes, len(planes), len(weights), height)
+        for part in parts:
+            bands = _Bands(convolution, part, planes, psfs, spectra, kept)
+            for strip in bands.strips():
+                transfers = bands.transfers(strip)
+                for b, total in enumerate(result):
+                    own = bands.columns(b, strip)
+                    held += [own] if hold else []
+                    mixed = _mixed(weights[:, part], bands.light(own) * transfers)
+                    _put(total[..., strip], convolution.back_columns(mixed, height), add=part.start > 0)
         ctx.save_for_backward(planes, psfs, spectra, weights, kept, *held)
         ctx.convolution = convolution
-        return torch.stack(
-            [convolution.back(torch.view_as_complex(total.view(channels, *buffer.shape[1:]))) for total in totals]
-        )
+        return convolution.back_rows(result, width)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, saved, grad):
         planes, psfs, spectra, weights, kept, *held = saved
-        convolution = ctx.convolution
+        convolution, in_order = ctx.convolution, iter(held)
         need_planes, need_psfs, need_spectra, need_weights = ctx.needs_input_grad[:4]
-        factors = None if spectra is None else convolution.transform(planes)
-        in_order = iter(held)
-        d_planes = torch.zeros_like(planes) if need_planes else None
-        d_factors = torch.zeros_like(factors) if need_planes and spectra is not None else None
         d_psfs = torch.empty_like(psfs) if need_psfs else None
-        d_spectra = torch.zeros_like(spectra) if need_spectra and spectra is not None else None
+        d_spectra = torch.zeros_like(spectra) if need_spectra else None
         d_weights = torch.zeros_like(weights) if need_weights else None
+        d_rows = convolution.room(planes, *planes.shape[:-1]) if need_planes else None
         with full_precision(grad.device):
-            ontos = convolution.back_adjoint(grad)
-            buffer = convolution.buffer(planes)
-            for part in convolution.parts(psfs.shape[0]):
-                mixing = weights[:, part.start : part.stop].T
-                d_transfers: list[Tensor] = []
-                transfers = []
-                if need_planes or need_spectra or need_weights:
-                    transfers = [_band_transfer(convolution, psfs, kept, index) for index in part]
-                for b, onto in enumerate(ontos):
-                    torch.mm(mixing, torch.view_as_real(onto).flatten(1), out=buffer[: len(part)].flatten(1))
-                    for slot, index in enumerate(part):
-                        mixed = torch.view_as_complex(buffer[slot])
+            onto_rows = convolution.conjugate_rows(grad)
+            for part in convolution.parts(len(psfs), len(planes)):
+                bands = _Bands(convolution, part, planes, psfs, spectra, kept)
+                d_psf_rows = convolution.room(psfs, *bands.psfs.shape[:-1]) if need_psfs else None
+                for strip in bands.strips():
+                    transfers = bands.transfers(strip) if need_planes or need_spectra or need_weights else None
+                    d_transfers = None
+                    for b, onto_row in enumerate(onto_rows):
+                        onto = convolution.conjugate_columns(onto_row, strip)
+                        d_product = _mixed(weights[:, part].T, onto)
+                        if need_psfs or need_spectra or need_weights:
+                            own = next(in_order) if held else bands.columns(b, strip)
                         if need_planes or need_spectra:
-                            d_band = mixed * transfers[slot].conj()
-                            if spectra is None and need_planes:
-                                extended = torch.fft.irfft2(d_band, s=convolution.size)
-                                d_planes[b, index] = extend_adjoint(extended, convolution)
-                            if d_factors is not None:
-                                d_factors[b].add_(spectra[:, index, None, None] * d_band)
+                            d_light = d_product * transfers
                             if d_spectra is not None:
-                                d_spectra[:, index] += _inner(factors[b], d_band, convolution)
+                                d_spectra[:, part] += convolution.inner(d_light, own, strip).T
+                            if d_rows is not None:
+                                d_own = d_light if spectra is None else _mixed(spectra[:, part], d_light)
+                                place = d_rows[b, part if spectra is None else _ALL, :, strip]
+                                add = spectra is not None and part.start > 0
+                                _put(place, convolution.columns_adjoint(d_own), add=add)
                         if need_psfs or need_weights:
-                            spectrum = next(in_order, None)
-                            if spectrum is None:
-                                spectrum = _band_spectrum(convolution, planes, spectra, factors, b, index)
-                            if need_weights:
-                                d_weights[:, index] += _inner(onto, spectrum * transfers[slot], convolution)
-                            if need_psfs and b == 0:
-                                d_transfers.append(spectrum * mixed.conj())
+                            light = bands.light(own)
+                            if d_weights is not None:
+                                d_weights[:, part] += convolution.inner(onto, light * transfers, strip)
+                            if d_transfers is not None:
+                                d_transfers.addcmul_(light, d_product)
                             elif need_psfs:
-                                d_transfers[slot].addcmul_(spectrum, mixed.conj())
-                for index, d_transfer in zip(part, d_transfers, strict=False):
-                    d_psfs[index] = convolution.transfer_adjoint(d_transfer)
-            if d_factors is not None:
-                d_planes = extend_adjoint(torch.fft.irfft2(d_factors, s=convolution.size), convolution)
+                                d_transfers = light * d_product
+                    if d_psf_rows is not None:
+                        d_strip = convolution.back_columns(d_transfers, psfs.shape[-2])
+                        _put(d_psf_rows[..., strip], d_strip, add=False)
+                if d_psfs is not None:
+                    d_psfs[part] = convolution.back_rows(d_psf_rows, psfs.shape[-1])
+            d_planes = None if d_rows is None else convolution.rows_adjoint(d_rows)
         return d_planes, d_psfs, d_spectra, d_weights, None, None
 
 
-def _band_spectrum(
-    convolution: Convolution, planes: Tensor, spectra: Tensor | None, factors: Tensor | None, b: int, index: int
-) -> Tensor:
-    if spectra is None or factors is None:
-        return convolution.transform(planes[b, index])
-    mixed = spectra[:, index] @ torch.view_as_real(factors[b]).flatten(1)
-    return torch.view_as_complex(mixed.view(*factors.shape[2:], 2))
+@dataclass
+class _Bands:
+    """Part of the bands: their transfer functions, and the spectra of their light, a strip of columns at a time."""
+
+    convolution: Convolution
+    part: slice
+    planes: Tensor
+    all_psfs: Tensor
+    spectra: Tensor | None
+    kept: Tensor | None
+
+    @property
+    def psfs(self) -> Tensor:
+        return self.all_psfs[self.part]
+
+    @functools.cached_property
+    def rows(self) -> list[Tensor]:
+        """Half spectra of the rows of each picture's planes."""
+        planes = self.planes if self.spectra is not None else self.planes[:, self.part]
+        return [self.convolution.rows(picture) for picture in planes]
+
+    @functools.cached_property
+    def _psf_rows(self) -> Tensor:
+        return self.convolution.conjugate_rows(self.psfs)
+
+    def strips(self) -> list[slice]:
+        return self.convolution.strips(self.planes, len(self.psfs))
+
+    def transfers(self, strip: slice) -> Tensor:
+        """Conjugate transfer functions of the bands, (g, strip, rows)."""
+        if self.kept is not None:
+            return self.kept[self.part, strip]
+        return self.convolution.conjugate_columns(self._psf_rows, strip)
+
+    def columns(self, b: int, strip: slice) -> Tensor:
+        """Spectra of the planes of picture b, (K, strip, rows)."""
+        return self.convolution.columns(self.rows[b], strip)
+
+    def light(self, columns: Tensor) -> Tensor:
+        """Spectra of the bands, (g, strip, rows)."""
+        return columns if self.spectra is None else _mixed(self.spectra[:, self.part].T, columns)
 
 
-def _band_transfer(convolution: Convolution, psfs: Tensor, kept: Tensor | None, index: int) -> Tensor:
-    return convolution.transfer(psfs[index]) if kept is None else kept[index]
+def _mixed(weights: Tensor, spectra: Tensor) -> Tensor:
+    """sum_k weights_mk spectra_k of complex spectra (K, ...) with real weights (M, K)."""
+    mixed = weights @ torch.view_as_real(spectra).flatten(1)
+    return torch.view_as_complex(mixed.view(-1, *spectra.shape[1:], 2))
 
 
-def _inner(a: Tensor, b: Tensor, convolution: Convolution) -> Tensor:
-    """Sum over the picture's plane of two real functions, from their half spectra (C, ...) and (...), by Parseval."""
-    product = a.real * b.real + a.imag * b.imag
-    double = product.new_full((product.shape[-1],), 2.0)
-    double[0] = 1.0
-    if convolution.size[1] % 2 == 0:
-        double[-1] = 1.0
-    return (product * double).sum((-2, -1)) / (convolution.size[0] * convolution.size[1])
-
-
-def extend_adjoint(extended: Tensor, convolution: Convolution) -> Tensor:
-    """Transpose of `extend` and of the zeros up to the transform's length: fold the border back onto the picture."""
-    for dim, n, m in zip((-2, -1), convolution.picture, convolution.window, strict=True):
-        before, after = m // 2, (m - 1) // 2
-        if convolution.border == "given":
-            extended = extended.narrow(dim, 0, n + before + after)
-            continue
-        if convolution.border == "zero":
-            extended = extended.narrow(dim, before, n)
-            continue
-        index = _border_index(torch.arange(-before, n + after, device=extended.device), n, convolution.border)
-        shape = list(extended.shape)
-        shape[dim] = n
-        used = extended.narrow(dim, 0, n + before + after)
-        extended = extended.new_zeros(shape).index_add_(dim, index, used)
-    return extended
+def _put(place: Tensor, values: Tensor, *, add: bool) -> None:
+    """Add values to a place, or write them there."""
+    place.add_(values) if add else place.copy_(values)
 
 
 def correlate(planes: Tensor, kernels: Tensor, *, groups: int = 1) -> Tensor:
@@ -549,13 +613,17 @@ def extend(planes: Tensor, window: tuple[int, int], border: str) -> Tensor:
     return planes
 
 
-def extend_along(planes: Tensor, window: int, border: str, *, dim: int) -> Tensor:
-    """`extend` along one axis, dim -2 or -1."""
+def extend_along(planes: Tensor, window: int, border: str, *, dim: int, length: int | None = None) -> Tensor:
+    """`extend` along one axis, dim -2 or -1; to a length, a border other than zeros goes on up to there."""
     n, before, after = planes.shape[dim], window // 2, (window - 1) // 2
     if border == "zero":
         return torch.nn.functional.pad(planes, (0, 0, before, after) if dim == -2 else (before, after))
-    index = torch.arange(-before, n + after, device=planes.device)
-    return planes.index_select(dim, _border_index(index, n, border))
+    index = torch.arange(-before, n + after if length is None else length - before, device=planes.device)
+    index = _border_index(index, n, border)
+    if dim == -2:
+        return planes.index_select(dim, index)
+    rows = planes.flatten(0, -2).index_select(-1, index)  # measured: of a matrix it takes a quarter of the time
+    return rows.unflatten(0, planes.shape[:-1])
 
 
 def _border_index(index: Tensor, n: int, border: str) -> Tensor:
