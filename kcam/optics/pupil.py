@@ -23,7 +23,7 @@ EDGE_MARGIN = 12  # samples of the grid beyond the rim, where low-passed edges s
 _EDGE_HALF_WIDTH = 6  # samples; half width of the low-pass for edge weights
 FINE = 5  # cells per sample in which the area of the rim is measured exactly
 _NODES_AT_ONCE = 32  # rows of edge weights; more take more memory than the cells that they share take time
-_SLAB_COLUMNS = 32  # of a banded matrix: narrow enough to leave out most zeros, wide enough for a matrix product
+_SLAB_NODES, _SLAB_PIXELS = 16, 32  # narrow enough to leave out most zeros, wide enough for a matrix product
 _MAP_HALF_WIDTH = 12  # samples; half width of the low-pass that brings a pixel map onto the pupil grid
 _MAP_BETA = 7.9  # 80 dB: passes 0.79 of the Nyquist frequency and stops from 1.21; kappa 2.5 needs 0.8 and 1.2
 
@@ -226,11 +226,11 @@ class _Banded:
     outputs: int
 
     @staticmethod
-    def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> _Banded:
-        """Cut the bands out of a dense matrix."""
+    def build(matrix: Tensor, *, width: int, dtype: torch.dtype, device: torch.device) -> _Banded:
+        """Cut the bands out of a dense matrix, in slabs of `width` columns."""
         outputs = matrix.shape[1]
         slabs, starts = [], []
-        for columns in matrix.split(_SLAB_COLUMNS, dim=1):
+        for columns in matrix.split(width, dim=1):
             rows = (columns != 0).any(1).nonzero().flatten()
             low, high = (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 1)
             slabs.append(columns[low:high].to(device, dtype))
@@ -266,8 +266,10 @@ class MapWeights:
     @staticmethod
     def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> MapWeights:
         """From the dense matrix (n, N)."""
-        banded = (_Banded.build(m, dtype=dtype, device=device) for m in (matrix, matrix.T))
-        return MapWeights(*banded)
+        return MapWeights(
+            forward=_Banded.build(matrix, width=_SLAB_NODES, dtype=dtype, device=device),
+            adjoint=_Banded.build(matrix.T, width=_SLAB_PIXELS, dtype=dtype, device=device),
+        )
 
 
 def pixel_under(values: Tensor, half_width: float | Tensor | None, axis: Tensor, semi_aperture: Tensor) -> Tensor:
