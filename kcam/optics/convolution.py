@@ -140,7 +140,7 @@ class Renderer:
         count, kept = psfs.shape[0], None
         if self._keeps(count, psfs):
             kept = self._transfers(count, lambda: convolution.transfer(psfs), psfs)
-        return lambda planes: Contraction.apply(planes, psfs, spectra, weights, kept, convolution)
+        return lambda planes: contract(planes, psfs, spectra, weights, kept, convolution)
 
     def _by_kernels(self, mixing: Tensor, psfs: Tensor) -> Callable[[Tensor], Tensor]:
         """sum_k (sum_g M_ckg h_g) C_k: for few channels and planes the PSFs are contracted, not the spectra."""
@@ -345,8 +345,7 @@ class Convolution:
     def strips(self, like: Tensor, count: int) -> list[slice]:
         """Columns of so many half spectra: on a CPU as many at once as stay in its cache."""
         columns = self.size[1] // 2 + 1
-        whole = like.device.type != "cpu" or torch.compiler.is_compiling()  # compiled, each would be traced by itself
-        step = columns if whole else max(_LINE, _STRIP // (count * self.size[0]))
+        step = max(_LINE, _STRIP // (count * self.size[0])) if like.device.type == "cpu" else columns
         return [slice(start, min(start + step, columns)) for start in range(0, columns, step)]
 
     def transform(self, planes: Tensor) -> Tensor:
@@ -458,6 +457,19 @@ def _in_cache(function: Callable[[Tensor], Tensor], planes: Tensor) -> Tensor:
     for place, part in zip(out.split(at_once), parts, strict=True):  # each is copied while it is near
         place.copy_(first if part is parts[0] else function(part))
     return out.unflatten(0, planes.shape[:-2])
+
+
+@torch.compiler.disable  # its transforms are compiled code as they are, and each strip would be traced by itself
+def contract(
+    planes: Tensor,
+    psfs: Tensor,
+    spectra: Tensor | None,
+    weights: Tensor,
+    kept: Tensor | None,
+    convolution: Convolution,
+) -> Tensor:
+    """Pictures (B, C, H, W) of planes (B, K, H, W) with PSFs (L, h, w): `Contraction`, as part of a graph."""
+    return Contraction.apply(planes, psfs, spectra, weights, kept, convolution)
 
 
 class Contraction(torch.autograd.Function):

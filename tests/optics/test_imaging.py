@@ -879,6 +879,24 @@ def test_what_is_held_stays_within_a_quarter_of_the_memory(tile: int | None, lay
     total.backward()
 
 
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # dynamo looks at it
+@pytest.mark.parametrize("planes", [None, 8], ids=["bands", "planes"])
+def test_a_rendering_compiles(planes: int | None) -> None:
+    """The contraction stands aside: fake tensors cannot follow its views of complex numbers."""
+    from kcam.optics.convolution import Renderer
+
+    psfs = torch.rand(1, 6, 21, 21, requires_grad=True)
+    spectra = None if planes is None else torch.rand(planes, 6)
+    renderer = Renderer(psfs, spectra=spectra, weights=torch.rand(3, 6), picture=(90, 80))
+    compiled = torch.compile(lambda light: renderer.blur(light, layer=0), backend="eager")
+    for batch in (1, 2):
+        light = torch.rand(batch, planes or 6, 90, 80)
+        expected, found = renderer.blur(light, layer=0), compiled(light)
+        assert torch.equal(found, expected)
+        (gradient,) = torch.autograd.grad(found.square().sum(), psfs)
+        assert torch.equal(gradient, torch.autograd.grad(expected.square().sum(), psfs)[0])
+
+
 def test_the_rows_of_a_part_of_the_bands_fit_into_a_quarter_of_the_memory() -> None:
     from kcam.optics.convolution import Convolution
 
