@@ -210,7 +210,7 @@ class _PixelField(torch.autograd.Function):
     def forward(ctx, phases, factors, amplitude, onto, layout):
         ctx.save_for_backward(phases, factors, amplitude)
         ctx.onto, ctx.layout = onto, layout
-        field = torch.stack([amplitude, amplitude])
+        field = amplitude.new_empty(2, *amplitude.shape)
         grids = []
         for factor in factors.T:
             for rows in _few_rows(amplitude):

@@ -305,13 +305,14 @@ class Convolution:
 
     The picture is upright, which turns the PSF by 180 degrees: a correlation, so transfer functions are conjugated,
     and the window's origin needs no shift: the picture is extended by window // 2 before its first pixel.
+    Half spectra are (..., F, rows), F = columns // 2 + 1: what is transformed last lies in lines of memory.
     """
 
     picture: tuple[int, int]
     window: tuple[int, int]
     border: str  # one of BORDERS, or "given": the planes come with what lies around them
     size: tuple[int, int]
-    bands: int  # at once, of one picture
+    bands: int  # planes whose half spectra fit into a quarter of the memory
     held: int  # planes whose spectra may wait for the backward pass
 
     @classmethod
@@ -501,7 +502,8 @@ class Contraction(torch.autograd.Function):
                     _put(total[..., strip], convolution.back_columns(mixed, height), add=part.start > 0)
         ctx.save_for_backward(planes, psfs, spectra, weights, kept, *held)
         ctx.convolution = convolution
-        return convolution.back_rows(result, width)
+        picture = convolution.back_rows(result, width)
+        return picture.clone(memory_format=torch.contiguous_format)  # of a view, nothing could be changed in place
 
     @staticmethod
     @once_differentiable
@@ -512,11 +514,14 @@ class Contraction(torch.autograd.Function):
         d_psfs = torch.empty_like(psfs) if need_psfs else None
         d_spectra = torch.zeros_like(spectra) if need_spectra else None
         d_weights = torch.zeros_like(weights) if need_weights else None
-        d_rows = convolution.room(planes, *planes.shape[:-1]) if need_planes else None
+        d_planes = torch.empty_like(planes) if need_planes else None
+        d_rows = convolution.room(planes, *planes.shape[:-1]) if need_planes and spectra is not None else None
         with full_precision(grad.device):
             onto_rows = convolution.conjugate_rows(grad)
             for part in convolution.parts(len(psfs), len(planes)):
                 bands = _Bands(convolution, part, planes, psfs, spectra, kept)
+                if d_planes is not None and spectra is None:  # bands of a part are planes of its own
+                    d_rows = convolution.room(planes, *planes[:, part].shape[:-1])
                 d_psf_rows = convolution.room(psfs, *bands.psfs.shape[:-1]) if need_psfs else None
                 for strip in bands.strips():
                     transfers = bands.transfers(strip) if need_planes or need_spectra or need_weights else None
@@ -532,9 +537,8 @@ class Contraction(torch.autograd.Function):
                                 d_spectra[:, part] += convolution.inner(d_light, own, strip).T
                             if d_rows is not None:
                                 d_own = d_light if spectra is None else _mixed(spectra[:, part], d_light)
-                                place = d_rows[b, part if spectra is None else _ALL, :, strip]
                                 add = spectra is not None and part.start > 0
-                                _put(place, convolution.columns_adjoint(d_own), add=add)
+                                _put(d_rows[b, ..., strip], convolution.columns_adjoint(d_own), add=add)
                         if need_psfs or need_weights:
                             light = bands.light(own)
                             if d_weights is not None:
@@ -548,7 +552,10 @@ class Contraction(torch.autograd.Function):
                         _put(d_psf_rows[..., strip], d_strip, add=False)
                 if d_psfs is not None:
                     d_psfs[part] = convolution.back_rows(d_psf_rows, psfs.shape[-1])
-            d_planes = None if d_rows is None else convolution.rows_adjoint(d_rows)
+                if d_planes is not None and spectra is None:
+                    d_planes[:, part] = convolution.rows_adjoint(d_rows)
+            if d_planes is not None and spectra is not None:
+                d_planes = convolution.rows_adjoint(d_rows)
         return d_planes, d_psfs, d_spectra, d_weights, None, None
 
 

@@ -879,6 +879,21 @@ def test_what_is_held_stays_within_a_quarter_of_the_memory(tile: int | None, lay
     total.backward()
 
 
+@pytest.mark.parametrize("side", [40, 300], ids=["few planes", "many"])
+def test_a_rendered_picture_can_be_changed_in_place(side: int) -> None:
+    """A view from inside the hand-written adjoint could not."""
+    from kcam.optics.convolution import Renderer
+
+    psfs = torch.rand(1, 6, 21, 21, requires_grad=True)
+    renderer = Renderer(psfs, spectra=None, weights=torch.rand(3, 6), picture=(side, side))
+    light = torch.rand(2, 6, side, side)
+    (expected,) = torch.autograd.grad(2 * renderer.blur(light, layer=0).sum(), psfs)
+    picture = renderer.blur(light, layer=0)
+    assert picture.is_contiguous()
+    (found,) = torch.autograd.grad(picture.mul_(2).sum(), psfs)
+    assert torch.allclose(found, expected, rtol=1e-4)
+
+
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # dynamo looks at it
 @pytest.mark.parametrize("planes", [None, 8], ids=["bands", "planes"])
 def test_a_rendering_compiles(planes: int | None) -> None:
