@@ -487,7 +487,7 @@ class Contraction(torch.autograd.Function):
     def forward(ctx, planes, psfs, spectra, weights, kept, convolution):
         height, width = convolution.picture
         parts = convolution.parts(len(psfs), len(planes))
-        spectra_of_all = planes[:, :, 0, 0].numel() * (1 if spectra is None else len(parts))
+        spectra_of_all = planes.shape[:2].numel() * (1 if spectra is None else len(parts))
         hold = any(ctx.needs_input_grad[1:4]) and spectra_of_all <= convolution.held
         held = []
         result = convolution.room(planes, len(planes), len(weights), height)
@@ -548,8 +548,7 @@ class Contraction(torch.autograd.Function):
                             elif need_psfs:
                                 d_transfers = light * d_product
                     if d_psf_rows is not None:
-                        d_strip = convolution.back_columns(d_transfers, psfs.shape[-2])
-                        _put(d_psf_rows[..., strip], d_strip, add=False)
+                        d_psf_rows[..., strip] = convolution.back_columns(d_transfers, psfs.shape[-2])
                 if d_psfs is not None:
                     d_psfs[part] = convolution.back_rows(d_psf_rows, psfs.shape[-1])
                 if d_planes is not None and spectra is None:
