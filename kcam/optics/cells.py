@@ -217,7 +217,7 @@ class _PixelField(torch.autograd.Function):
                 for values, part in zip(_sines(factor, phases[:, rows]), field, strict=True):
                     torch.mul(values, amplitude[rows], out=part[rows])
             grids.append([layout.arrange(onto.forward(part)) for part in field])
-        return torch.stack([torch.stack(parts) for parts in zip(*grids, strict=True)])
+        return torch.stack([part for parts in zip(*grids, strict=True) for part in parts]).unflatten(0, (2, -1))
 
     @staticmethod
     @once_differentiable
