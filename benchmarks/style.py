@@ -5,10 +5,10 @@
     python -m benchmarks.style --collect                                                        write what is committed
     python -m benchmarks.style --paint                                                          docs/painted.jpg
 
-Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting; it is measured on three
-other photographs of 256 pixels, against the ordinary camera's picture and a crop of the painting's right half
-(`style_measures`, which no arm is trained on, and the training loss). Runs are kept in the work folder one by one, so
-that two processes can share them.
+Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting, or of all of it, as
+`kcam train` does; it is measured on three other photographs of 256 pixels, against the ordinary camera's picture and a
+crop of the painting's right half (`style_measures`, which no arm is trained on, and the training loss). Runs are kept
+in the work folder one by one, so that two processes can share them.
 """
 
 from __future__ import annotations
@@ -79,13 +79,14 @@ def thesis_camera(*, ordinary: bool = False, straight_through: bool = False) -> 
 
 @dataclass(frozen=True)
 class Arm:
-    """What is trained and how: camera, the loss's arguments, settings. note: for the table."""
+    """What is trained and how: camera, the loss's arguments, settings. note: for tables. whole: on all of a style."""
 
     note: str
     camera: Callable[[], Camera]
     loss: dict[str, Any]
     settings: Settings
     styles: tuple[str, ...] = field(default=tuple(STYLES))
+    whole: bool = False
 
 
 OURS = ("optics", "filter", "convolution", "stage")
@@ -115,6 +116,7 @@ ARMS: dict[str, Arm] = {
         only("optics", "filter", "demosaic", "tone"),
     ),
     "stage": Arm("+ style stage: kcam train", style_camera, QUICK.loss, QUICK.settings),
+    "whole": Arm("kcam train, on all of the painting", style_camera, QUICK.loss, QUICK.settings, whole=True),
     "thesis": Arm("the thesis's arrangement", thesis_camera, THESIS_LOSS, THESIS),
     "thesis, our start": Arm(
         "ordinary start, non-negative filter", lambda: thesis_camera(ordinary=True), THESIS_LOSS, THESIS, ("strokes",)
@@ -182,9 +184,9 @@ def run(style: str, name: str, work: Path, *, seed: int = 0) -> dict[str, Any]:
     """Train an arm, write its pictures, and measure."""
     arm = ARMS[name]
     settings = replace(arm.settings, seed=seed)
-    own, _ = halves(style)
+    shown = painting(style) if arm.whole else halves(style)[0]
     camera = arm.camera()
-    loss = StyleLoss(own, crop=settings.size, **arm.loss)
+    loss = StyleLoss(shown, crop=settings.size, **arm.loss)
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -620,12 +620,13 @@ STYLE_MEASURES = {
 
 
 def style_rows(which: str) -> list[dict[str, Any]]:
-    """The runs of the thesis's arrangement and its repairs, of ours, or of the arms that ran by several seeds."""
+    """The runs of "ours", of the "thesis"'s arrangement, on the "whole" painting, or of arms with several "seeds"."""
     rows = json.loads((RESULTS / "style.json").read_text())["rows"]
     if which == "seeds":
         again = {(row["style"], row["arm"]) for row in rows if row["seed"]}
         return [row for row in rows if (row["style"], row["arm"]) in again]
-    return [row for row in rows if not row["seed"] and row["arm"].startswith("thesis") == (which == "thesis")]
+    kinds = [next((kind for kind in ("thesis", "whole") if row["arm"].startswith(kind)), "ours") for row in rows]
+    return [row for row, kind in zip(rows, kinds, strict=True) if kind == which and not row["seed"]]
 
 
 def style_table(which: str, **columns: str) -> str:
@@ -644,6 +645,7 @@ def style_table(which: str, **columns: str) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "style": lambda: style_table("ours", style="style", note="what trains"),
     "seeds": lambda: style_table("seeds", style="style", seed="seed"),
+    "whole": lambda: style_table("whole", style="style"),
     "thesis": lambda: style_table("thesis", note="arrangement", style="style"),
     "propagators": propagators_table,
     "tradeoff": tradeoff_table,
