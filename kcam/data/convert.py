@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kcam.data.cube import SUFFIX, CubeError, first_line, write_source
+from kcam.data.cube import SUFFIX, CubeError, words_of, write_source
 from kcam.data.readers import Options, open_source, resampled, scene_name, scenes_in
 
 
@@ -129,7 +129,7 @@ def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
     except MemoryError:
         return "it does not fit into memory."
     except Exception as error:
-        return f"it cannot be read: {type(error).__name__}: {first_line(error)}"
+        return f"it cannot be read: {words_of(error)}"
 
 
 def _depth(path: Path) -> np.ndarray:

@@ -39,9 +39,14 @@ class CubeError(ValueError):
 NOTHING_VALID = "it holds no valid pixel: all are NaN, infinite or marked as invalid."
 
 
-def first_line(error: BaseException) -> str:
-    """What a library's error says, in one line of bounded length."""
-    return (str(error).strip().splitlines() or [""])[0][:200]
+def words_of(error: BaseException) -> str:
+    """What a library's error says, in one line of bounded length.
+
+    Raises:    KeyboardInterrupt where that is its cause: compiled code into which Ctrl-C falls may end in SystemError.
+    """
+    if isinstance(error.__cause__, KeyboardInterrupt):
+        raise error.__cause__
+    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
 
 
 @dataclass(frozen=True)
@@ -151,8 +156,7 @@ class Source:
         except MemoryError as error:
             raise CubeError("it does not fit into memory.") from error
         except Exception as error:
-            what = f"{type(error).__name__}: {first_line(error)}"
-            raise CubeError(f"rows {first} to {last} cannot be read: {what}") from error
+            raise CubeError(f"rows {first} to {last} cannot be read: {words_of(error)}") from error
         finite = np.isfinite(values).all(0)
         valid = finite if valid is None else valid & finite
         if valid.all():

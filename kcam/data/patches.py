@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from kcam import __version__
-from kcam.data.cube import NOTHING_VALID, SUFFIX, CubeError, Source, first_line, open_cube
+from kcam.data.cube import NOTHING_VALID, SUFFIX, CubeError, Source, open_cube, words_of
 from kcam.files import replace, replacing
 from kcam.units import nm
 
@@ -219,7 +219,7 @@ def _opened(path: Path) -> Source:
     except (CubeError, OSError):
         raise
     except Exception as error:
-        raise CubeError(f"it cannot be read: {type(error).__name__}: {first_line(error)}") from error
+        raise CubeError(f"it cannot be read: {words_of(error)}") from error
 
 
 # ---- one scene -----------------------------------------------------------------------------------------------------
@@ -496,7 +496,7 @@ def work_on(job: SceneJob, settings: Settings, out: str) -> str | None:
     except MemoryError:
         return "it does not fit into memory."
     except Exception as error:
-        return f"it cannot be read: {type(error).__name__}: {first_line(error)}"
+        return f"it cannot be read: {words_of(error)}"
     return None
 
 

@@ -23,7 +23,7 @@ import torch
 
 from kcam import spectral
 from kcam.data.bands import resampling
-from kcam.data.cube import MOST_VALUES, Cube, CubeError, Source, first_line, is_cube, open_cube
+from kcam.data.cube import MOST_VALUES, Cube, CubeError, Source, is_cube, open_cube, words_of
 from kcam.scene import Scene, read_picture
 from kcam.units import nm, wavelength_grid
 
@@ -120,7 +120,7 @@ def open_source(path: Path, *, format: str | None = None, options: Options | Non
     except MemoryError as error:
         raise CubeError("it does not fit into memory.") from error
     except Exception as error:
-        raise CubeError(f"it cannot be read as {row.name}: {type(error).__name__}: {first_line(error)}") from error
+        raise CubeError(f"it cannot be read as {row.name}: {words_of(error)}") from error
 
 
 def recognised(path: Path) -> Format | None:

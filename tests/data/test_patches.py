@@ -503,6 +503,25 @@ def test_a_disk_that_cannot_be_read_fails_the_scene_alone(cubes: Path, tmp_path:
     assert "failed: cat: rows 0 to 16 cannot be read: OSError: " in extract_tool(cubes, tmp_path / "out", status=1)
 
 
+def test_ctrl_c_inside_compiled_code_is_no_damage(cubes: Path, store: Path, tmp_path: Path, monkeypatch):
+    """There it may end in a SystemError whose cause it is."""
+    opened = patches.open_cube
+
+    def interrupted(path: Path):
+        source = opened(path)
+
+        def rows(first: int, last: int):
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+        return replace(source, rows=rows) if path.stem == "cat" else source
+
+    with monkeypatch.context() as patch:
+        patch.setattr(patches, "open_cube", interrupted)
+        assert "interrupted; --resume goes on." in extract_tool(cubes, tmp_path / "out", status=130)
+    extract_tool(cubes, tmp_path / "out", "--resume")
+    assert content(tmp_path / "out") == content(store)
+
+
 class Futures:
     """An executor of the simplest kind: its futures run when they are asked."""
 
