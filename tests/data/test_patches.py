@@ -488,35 +488,32 @@ def test_a_full_disk_stops_and_resume_goes_on(cubes: Path, store: Path, tmp_path
     assert content(tmp_path / "out") == content(store)
 
 
-def test_a_disk_that_cannot_be_read_fails_the_scene_alone(cubes: Path, tmp_path: Path, monkeypatch):
+def fail_to_read(scene: str, error: Exception, patch: pytest.MonkeyPatch) -> None:
+    """The rows of this scene raise an error."""
     opened = patches.open_cube
 
     def broken(path: Path):
         source = opened(path)
 
         def rows(first: int, last: int):
-            raise OSError(errno.EIO, "Input/output error")
+            raise error
 
-        return replace(source, rows=rows) if path.stem == "cat" else source
+        return replace(source, rows=rows) if path.stem == scene else source
 
-    monkeypatch.setattr(patches, "open_cube", broken)
+    patch.setattr(patches, "open_cube", broken)
+
+
+def test_a_disk_that_cannot_be_read_fails_the_scene_alone(cubes: Path, tmp_path: Path, monkeypatch):
+    fail_to_read("cat", OSError(errno.EIO, "Input/output error"), monkeypatch)
     assert "failed: cat: rows 0 to 16 cannot be read: OSError: " in extract_tool(cubes, tmp_path / "out", status=1)
 
 
 def test_ctrl_c_inside_compiled_code_is_no_damage(cubes: Path, store: Path, tmp_path: Path, monkeypatch):
     """There it may end in a SystemError whose cause it is."""
-    opened = patches.open_cube
-
-    def interrupted(path: Path):
-        source = opened(path)
-
-        def rows(first: int, last: int):
-            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
-
-        return replace(source, rows=rows) if path.stem == "cat" else source
-
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
     with monkeypatch.context() as patch:
-        patch.setattr(patches, "open_cube", interrupted)
+        fail_to_read("cat", error, patch)
         assert "interrupted; --resume goes on." in extract_tool(cubes, tmp_path / "out", status=130)
     extract_tool(cubes, tmp_path / "out", "--resume")
     assert content(tmp_path / "out") == content(store)
