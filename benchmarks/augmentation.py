@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 import kcam.augmentation as KC
 from benchmarks.common import Contestant, environment, race, write_json
-from kcam import Camera, Scene, isp, measure, optics, sensor
+from kcam import Camera, Scene, isp, measure, optics, sensor, threads
 from kcam.augmentation.base import is_picture, to_light, wavelengths_of
 from kcam.augmentation.isp import planck_ratio
 from kcam.context import Context
@@ -428,7 +428,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.quick:
         sizes = {"batch": 2, "side": 32, "seconds": 0.0}
     console, lines = Console(), []
-    with measure.one_thread(), torch.random.fork_rng():
+    with threads.fixed(1), torch.random.fork_rng():
         for channels in CHANNELS:
             for name, case in CASES.items():
                 if channels not in case.only or (options.only and options.only not in name):

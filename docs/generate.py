@@ -625,9 +625,11 @@ def style_rows(which: str) -> list[dict[str, Any]]:
     if which == "seeds":
         again = {(row["style"], row["arm"]) for row in rows if row["seed"]}
         return [row for row in rows if (row["style"], row["arm"]) in again]
-    others = ("thesis", "whole")
-    arms = {row["arm"] for row in rows if row["arm"].startswith(which if which in others else others) == (which in others)}
-    return [row for row in rows if row["arm"] in arms and not row["seed"]]
+
+    def kind(row: dict[str, Any]) -> str:
+        return next((kind for kind in ("thesis", "whole") if row["arm"].startswith(kind)), "ours")
+
+    return [row for row in rows if kind(row) == which and not row["seed"]]
 
 
 def style_table(which: str, **columns: str) -> str:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from kcam import files, isp, optics, sensor
 from kcam.context import Context, Stage
 from kcam.scene import Scene
+from kcam.threads import no_more_than_free
 from kcam.units import mm, nm, um
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ class Camera(nn.Module):
             fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance")}
         return dataclasses.replace(self.context or Context(), **fields, generator=generator)
 
+    @no_more_than_free()
     def forward(
         self,
         scene: Scene | Tensor,

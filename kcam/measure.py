@@ -11,8 +11,7 @@ import json
 import platform
 import re
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -50,17 +49,6 @@ def _resident(*, reset: bool = False) -> int | None:
         return int(found[1]) * 1024 if found else None
     except (OSError, AttributeError):
         return None
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while: CPU seconds of several threads are no one's time."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def environment() -> dict[str, Any]:

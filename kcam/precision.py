@@ -1,4 +1,7 @@
-"""Where reduced precision would be read as light: no autocast and no shortened matrix products."""
+"""Where reduced precision would be read as light: no autocast and no shortened matrix products.
+
+It is also where the time goes, so on a CPU no more threads take part than there are free cores.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,14 @@ from collections.abc import Iterator
 
 import torch
 
+from kcam.threads import no_more_than_free
+
 
 @contextlib.contextmanager
 def full_precision(device: torch.device) -> Iterator[None]:
     """No autocast and no reduced-precision matrix products: their 1e-3 would be read as light (restored on exit).
+
+    On a CPU with no more threads than other work leaves cores: see `kcam.threads`.
 
     torch.compile cannot trace a change of the global precision: a compiled stage takes that of its caller.
     """
@@ -21,7 +28,8 @@ def full_precision(device: torch.device) -> Iterator[None]:
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:
-        with torch.autocast(device.type, enabled=False):
+        threads = no_more_than_free() if device.type == "cpu" else contextlib.nullcontext()
+        with threads, torch.autocast(device.type, enabled=False):
             yield
     finally:
         torch.set_float32_matmul_precision(before)

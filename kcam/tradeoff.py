@@ -24,7 +24,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from torch import Tensor
 from torch.nn import functional as F
 
-from kcam import isp, measure, sensor
+from kcam import isp, measure, sensor, threads
 from kcam.camera import Camera
 from kcam.optics import PROPAGATORS, Imaging
 from kcam.optics.propagation import PHYSICS, Propagator, choose
@@ -419,7 +419,7 @@ def sweep(
     started = time.monotonic()
     advance = advance or (lambda what: None)
     every = settings(camera, scene, thorough=thorough, knobs=knobs)
-    with torch.no_grad(), measure.one_thread():
+    with torch.no_grad(), threads.fixed(1):
         advance("reference")
         truth = _Truth.of(camera, scene, window=THOROUGH_WINDOW if thorough else WINDOW)
         rows = []

@@ -21,6 +21,7 @@ from kcam import __version__, files, isp, plots, report, style
 from kcam.camera import Camera
 from kcam.scene import Scene, read_picture
 from kcam.style.processes import place, told_by_the_first
+from kcam.threads import fixed, free_cores
 
 fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 
@@ -113,7 +114,7 @@ def run(
     with ExitStack() as stack:
         leads, device = stack.enter_context(_processes(options.device))
         document["threads"] = told_by_the_first(_threads(folder, resume, threads), place()[1])
-        stack.enter_context(_threads_set(document["threads"]))
+        stack.enter_context(fixed(document["threads"]))
         if leads:  # the others would meet what this one has begun to write
             stack.enter_context(_alone(folder))
             _check_folder(folder, document, resume=resume)
@@ -268,20 +269,7 @@ def _threads(folder: Path, resume: bool, threads: int | None) -> int:
         if threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}.")
         return threads
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    free = max(1, min(cores, round(cores - busy)))
-    return max(1, free // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
-
-
-@contextmanager
-def _threads_set(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    return max(1, free_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 @contextmanager

@@ -23,16 +23,6 @@ def test_waiting_takes_no_cpu_time() -> None:
     assert measure.cpu_time(lambda: time.sleep(0.2)) < 0.1
 
 
-def test_one_thread_for_a_while() -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    with measure.one_thread():
-        assert torch.get_num_threads() == 1
-        assert measure.environment()["threads"] == 1
-    assert torch.get_num_threads() == 2
-    torch.set_num_threads(before)
-
-
 def test_json_has_four_digits(tmp_path: Path) -> None:
     measure.write_json(tmp_path / "new" / "x.json", {"a": [1.23456, (2.0, 3)], "b": {"c": 1e-7 / 3}, "d": True})
     content = json.loads((tmp_path / "new" / "x.json").read_text())

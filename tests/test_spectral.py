@@ -53,7 +53,12 @@ class TestTables:
             with np.load(tables.TABLES / f"{name}.npz") as stored:
                 assert set(stored) == set(arrays)
                 for key, values in arrays.items():
-                    np.testing.assert_array_equal(stored[key], values)
+                    assert stored[key].dtype == values.dtype
+                    if np.issubdtype(values.dtype, np.inexact):  # other processors sum in another order
+                        scale = np.abs(values).max(initial=0)
+                        np.testing.assert_allclose(stored[key], values, rtol=1e-12, atol=1e-14 * scale)
+                    else:
+                        np.testing.assert_array_equal(stored[key], values)
 
     def test_the_tool_writes_the_same_bytes(self, tables: ModuleType, tmp_path: Path, monkeypatch) -> None:
         monkeypatch.setattr(tables, "TABLES", tmp_path)

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from kcam.ste import clip_ste
 from kcam.style.draws import torch_generator
 from kcam.style.losses import StyleLoss, check_picture
+from kcam.threads import no_more_than_free
 
 STARTS = ("photo", "noise")
 NOISE = 0.15  # RMS of the white noise that a picture may start from, around gray
@@ -74,14 +75,15 @@ def paint(
     spectrum = torch.view_as_real(torch.fft.rfft2(begun - GRAY, norm="ortho") / scale).clone().requires_grad_()
     optimiser = torch.optim.Adam([spectrum], lr=rate)
     for step in range(steps):
-        optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
-        optimiser.zero_grad()
-        terms = loss.terms(_picture(spectrum, scale, (rows, columns)), scene, turn=step)
-        total = torch.stack(list(terms.values())).sum()
-        if not total.isfinite():
-            raise ValueError(f"the loss is {total.item():g} at step {step}. Use a lower rate than {rate:g}.")
-        total.backward()
-        optimiser.step()
+        with no_more_than_free():
+            optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+            optimiser.zero_grad()
+            terms = loss.terms(_picture(spectrum, scale, (rows, columns)), scene, turn=step)
+            total = torch.stack(list(terms.values())).sum()
+            if not total.isfinite():
+                raise ValueError(f"the loss is {total.item():g} at step {step}. Use a lower rate than {rate:g}.")
+            total.backward()
+            optimiser.step()
         if advance is not None:
             advance(step + 1, {name: float(value.detach()) for name, value in terms.items()})
     with torch.no_grad():

@@ -15,6 +15,7 @@ from kcam.style.processes import anywhere
 from kcam.style.run import Run
 from kcam.style.scenes import BuiltinScenes, Source
 from kcam.style.settings import Settings
+from kcam.threads import fixed
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class Trained:
     finished: bool
 
 
+@fixed()
 def fit(
     camera: Camera,
     loss: StyleLoss,
