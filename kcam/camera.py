@@ -175,7 +175,14 @@ class Camera(nn.Module):
         return explain(self, scene, tolerance=tolerance, measure=measure, max_memory=max_memory)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write weights and configuration into one .safetensors file; `kcam.files.describe` reads the latter back."""
+        """Write weights and configuration into one .safetensors file; `kcam.files.describe` reads the latter back.
+
+        Stages may be kcam's, torch's own layers (`kcam.layers.NAMES`: Sequential, convolutions, Linear, norms,
+        activations, pooling, upsampling, ...), and classes of yours that keep their constructor's arguments.
+
+        Raises:    as `kcam.files.save`: ValueError for other layers of torch's, TypeError for classes of yours that
+                   cannot be built again.
+        """
         from kcam import __version__
 
         files.save(self, path, classes=_classes(), version=__version__)

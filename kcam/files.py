@@ -3,36 +3,86 @@
 The configuration lives in the safetensors metadata. It names each module's class and its constructor arguments, which
 every kcam module stores as attributes of the same name, or gives by a method ``configuration()``; ``cls(**arguments)``
 rebuilds it. Tensors stand in the file under their module path, as in ``state_dict()``. Only classes that the reader's
-table lists are ever built.
+table lists are ever built, and those of torch's layers that `kcam.layers` lists.
 
     {"class": "sensor.ReadNoise", "arguments": {"sigma_electrons": 3.0, "full_well": null}}
 
 Numbers, strings, true, false and null are themselves; an infinite float is {"float": "inf"}; an array is a tuple; a
 tensor is {"tensor": key, "shape": ...}, a parameter {"parameter": key, "shape": ..., "trainable": ...}; a module that
-occurs again is {"same": path}.
+occurs again is {"same": path}. A layer of torch's also names its "tensors", and says "training": false where it is.
 """
 
 from __future__ import annotations
 
+import builtins
 import inspect
 import json
 import math
 import os
 import secrets
+import sys
+import types
+import typing
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor, nn
 
+from kcam import layers
 from kcam.context import Context
+from kcam.plain import fitting, from_json
 
 FORMAT = 1
 """Version of the file format: raised when an older kcam could no longer read what a newer one writes."""
+FIX = "Save the camera again."
+
+
+class _Version(TypedDict):
+    format: int
+    kcam: str
+
+
+class _Document(_Version):
+    configuration: Any
+    aliases: dict[str, str]
+    state: list[str]
+
+
+class _Float(TypedDict):
+    float: Literal["inf", "-inf", "nan"]
+
+
+class _Same(TypedDict):
+    same: str
+
+
+class _Held(TypedDict):
+    tensor: str
+    shape: tuple[int, ...]
+
+
+class _Trained(TypedDict):
+    parameter: str
+    shape: tuple[int, ...]
+    trainable: bool
+
+
+_Built = TypedDict(
+    "_Built",
+    {
+        "class": str,
+        "arguments": dict[str, Any],
+        "tensors": NotRequired[dict[str, Any]],
+        "training": NotRequired[bool],
+    },
+)
+NODES = {"float": _Float, "same": _Same, "tensor": _Held, "parameter": _Trained, "class": _Built}
+"""What a dict in a configuration is, by the key that it has."""
 
 
 def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[str, type], version: str) -> None:
@@ -44,7 +94,8 @@ def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[st
                reader must hand it in.
                version: of kcam, for the reader's information.
     Raises:    TypeError for an argument that cannot be written or that its class does not keep;
-               ValueError for a name that does not end in .safetensors, or is a folder's;
+               ValueError for a name that does not end in .safetensors, or is a folder's, and for a layer of torch's
+               that is not among `kcam.layers.NAMES` or was changed after it was made;
                FileNotFoundError if the folder does not exist.
     """
     path = Path(path)
@@ -79,9 +130,14 @@ def load(path: str | os.PathLike[str], *, classes: Mapping[str, type]) -> Any:
                that `classes` lacks, or with a tensor that is missing or has another shape.
     """
     document, tensors = _read(Path(path))
-    reader = _Reader(classes, tensors, path)
-    with torch.random.fork_rng(devices=[]):
-        module = reader.decode(document["configuration"], path="")
+    reader = _Reader(layers.LAYERS | dict(classes), tensors, path)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            module = reader.decode(document["configuration"], path="")
+    except RecursionError:
+        raise reader.damaged("its configuration is nested too deeply") from None
+    if not isinstance(module, nn.Module):
+        raise reader.damaged(f"it holds a {type(module).__name__}, expected a module")
     aliases = document["aliases"]
     state = {key: reader.tensor(aliases.get(key, key)) for key in document["state"]}
     try:
@@ -138,11 +194,17 @@ class _Writer:
         self.seen[id(value)] = path
         self.alive.append(value)
         cls = type(value)
-        arguments = {}
-        for name, argument in _arguments(value).items():
-            owner = f"{cls.__qualname__}({name}=)"
-            arguments[name] = self.encode(argument, path=_join(path, name), owner=owner)
-        return {"class": self.names.get(cls, cls.__qualname__), "arguments": arguments}
+        layer = layers.is_layer(value)
+        given = layers.arguments(value) if layer else _arguments(value)
+        node: dict[str, Any] = {"class": self.names.get(cls, f"torch.nn.{cls.__name__}" if layer else cls.__qualname__)}
+        for part, members in (("arguments", given), ("tensors", layers.tensors(value) if layer else {})):
+            node[part] = {
+                name: self.encode(member, path=_join(path, name), owner=f"{cls.__qualname__}({name}=)")
+                for name, member in members.items()
+            }
+        if not node["tensors"]:
+            del node["tensors"]
+        return node | ({"training": False} if layer and not value.training else {})
 
 
 class _Reader:
@@ -154,9 +216,12 @@ class _Reader:
         self.file = file
         self.built: dict[str, Any] = {}  # path or key -> what stands there, so that what was shared stays shared
 
+    def damaged(self, reason: str) -> ValueError:
+        return ValueError(f"{self.file}: {reason}: the file is damaged. {FIX}")
+
     def tensor(self, key: str) -> Tensor:
         if key not in self.tensors:
-            raise ValueError(f"{self.file} lacks the tensor {key!r}: the file is damaged. Save the camera again.")
+            raise ValueError(f"{self.file} lacks the tensor {key!r}: the file is damaged. {FIX}")
         return self.tensors[key]
 
     def decode(self, value: Any, *, path: str) -> Any:
@@ -164,41 +229,65 @@ class _Reader:
             return tuple(self.decode(item, path=_join(path, index)) for index, item in enumerate(value))
         if not isinstance(value, dict):
             return value
-        if "float" in value:
-            return float(value["float"])
-        if "same" in value:
-            return self.built[value["same"]]
-        if "class" in value:
-            self.built[path] = self.build(value["class"], value["arguments"], path=path)
-            return self.built[path]
-        key: str = value["parameter"] if "parameter" in value else value["tensor"]
+        kind = next((key for key in NODES if key in value), None)
+        if kind is None:
+            raise self.damaged(f"what {path or 'it'} is, is none of {', '.join(NODES)}")
+        try:
+            node = fitting(value, NODES[kind], path)
+        except ValueError as error:
+            raise self.damaged(f"{error}") from None
+        match kind:
+            case "float":
+                return float(node["float"])
+            case "same" if node["same"] not in self.built:
+                raise self.damaged(f"{path} is the same as {node['same']!r}, which comes before it nowhere")
+            case "same":
+                return self.built[node["same"]]
+            case "class":
+                self.built[path] = self.build(node, path=path)
+                return self.built[path]
+        key: str = node[kind]
         tensor = self.tensor(key)
-        if list(tensor.shape) != value["shape"]:
+        if tuple(tensor.shape) != node["shape"]:
             raise ValueError(
                 f"{self.file}: the tensor {key!r} has shape {tuple(tensor.shape)}, but the configuration says "
-                f"{tuple(value['shape'])}: the file is damaged. Save the camera again."
+                f"{node['shape']}: the file is damaged. {FIX}"
             )
-        if "parameter" in value and key not in self.built:
-            self.built[key] = nn.Parameter(tensor, requires_grad=value["trainable"])
-        return self.built.get(key, tensor)
+        if kind == "tensor":
+            return tensor
+        if not isinstance(self.built.get(key), nn.Parameter):
+            if node["trainable"] and not (tensor.is_floating_point() or tensor.is_complex()):
+                raise self.damaged(f"the parameter {key!r} is of {tensor.dtype}, which cannot be trained")
+            self.built[key] = nn.Parameter(tensor, requires_grad=node["trainable"])
+        return self.built[key]
 
-    def build(self, name: str, arguments: dict[str, Any], *, path: str) -> Any:
+    def build(self, node: dict[str, Any], *, path: str) -> Any:
+        name = node["class"]
         if name not in self.classes:
             raise ValueError(
                 f"{self.file} needs the class {name!r}, which is not one of kcam's. If it is yours, hand it in: "
                 f"Camera.load({str(self.file)!r}, custom=[{name.split('.')[-1]}])."
             )
         cls = self.classes[name]
-        values = {key: self.decode(item, path=_join(path, key)) for key, item in arguments.items()}
-        positional: list[Any] = []
-        for key, parameter in _constructor(cls).items():
-            if parameter.kind is parameter.VAR_POSITIONAL:
-                positional.extend(values.pop(key, ()))
-            elif parameter.kind is parameter.POSITIONAL_ONLY and key in values:
-                positional.append(values.pop(key))
+        values, tensors = (
+            {key: self.decode(item, path=_join(path, key)) for key, item in part.items()}
+            for part in (node["arguments"], node.get("tensors", {}))
+        )
         try:
+            values = fitting_arguments(cls, values)
+            if cls in layers.KINDS:
+                layer = layers.fill(layers.empty(cls, values), tensors)
+                return layer.train(node.get("training", True))
+            positional: list[Any] = []
+            for key, parameter in _constructor(cls).items():
+                if parameter.kind is parameter.VAR_POSITIONAL:
+                    positional.extend(values.pop(key, ()))
+                elif parameter.kind is parameter.POSITIONAL_ONLY and key in values:
+                    positional.append(values.pop(key))
             return cls(*positional, **values)
-        except TypeError as error:
+        except RecursionError:
+            raise
+        except Exception as error:  # a constructor that is given anything may raise anything
             raise ValueError(f"{self.file}: {name} no longer takes the saved arguments: {error}") from error
 
 
@@ -210,6 +299,36 @@ def _constructor(cls: type) -> dict[str, inspect.Parameter]:
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         raise TypeError(f"cannot save {cls.__qualname__}: its constructor takes **kwargs. Name its arguments.")
     return parameters
+
+
+class _Names(dict[str, Any]):
+    """Names of a module and Python's own; what is imported for the type checker alone may be anything."""
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Any)
+
+
+def fitting_arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of the types that a constructor's annotations name, as far as they do: see `plain.fitting`.
+
+    Only of kcam's classes and torch's, for others may say of their types what they like.
+
+    Raises:    ValueError for an argument of another type, or that the constructor does not have.
+    """
+    if cls.__module__.partition(".")[0] not in ("kcam", "torch") or cls in (nn.Sequential, nn.Identity):
+        return dict(values)
+    start: Any = cls.__init__  # type: ignore[misc]
+    hints = typing.get_type_hints(start, localns=_Names(vars(sys.modules[cls.__module__])))
+    parameters = inspect.signature(cls).parameters
+    fitted = {}
+    for name, value in values.items():
+        if name not in parameters:
+            raise ValueError(f"there is no argument {name!r}")
+        expected = hints.get(name, Any)
+        if parameters[name].kind is inspect.Parameter.VAR_POSITIONAL:
+            expected = types.GenericAlias(tuple, (expected, ...))
+        fitted[name] = fitting(value, expected, name)
+    return fitted
 
 
 def _arguments(value: Any) -> dict[str, Any]:
@@ -245,13 +364,14 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise ValueError(f"{path} is not a whole safetensors file ({error}): it is damaged, or no camera.") from error
     if "kcam" not in metadata:
         raise ValueError(f"{path} holds weights but no camera: it was not written by Camera.save.")
-    document = json.loads(metadata["kcam"])
-    if document["format"] > FORMAT:
+    damaged = f"{path} is damaged, or no camera"
+    version: _Version = from_json(metadata["kcam"], _Version, wrong=damaged, fix=FIX, hook=None)
+    if version["format"] > FORMAT:
         raise ValueError(
-            f"{path} was written by kcam {document['kcam']} in format {document['format']}; this kcam reads up to "
+            f"{path} was written by kcam {version['kcam']} in format {version['format']}; this kcam reads up to "
             f"format {FORMAT}. Update kcam."
         )
-    return document, tensors
+    return from_json(metadata["kcam"], _Document, wrong=damaged, fix=FIX, hook=None), tensors
 
 
 def check_other(path: str | os.PathLike[str], given: str | os.PathLike[str] | None) -> None:

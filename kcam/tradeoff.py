@@ -7,7 +7,6 @@ PSFs against the `reference` propagator, of the raw and of the picture against t
 from __future__ import annotations
 
 import functools
-import json
 import math
 import os
 import statistics
@@ -31,6 +30,7 @@ from kcam.optics.propagation import PHYSICS, Propagator, choose
 from kcam.optics.psf import Query, samples_by_rule
 from kcam.optics.reference import Convergence, checked_psf
 from kcam.optics.textbook import textbook_angular_spectrum_row, textbook_row
+from kcam.plain import from_json
 from kcam.planner.plan import ENDS, with_imaging
 from kcam.scene import Scene
 
@@ -77,7 +77,7 @@ class Row:
     raw_rms: float | None = None
     delta_e: float | None = None
     seconds: float | None = None
-    seconds_iqr: tuple[float, ...] | None = None
+    seconds_iqr: tuple[float, float] | None = None
     seconds_kept: float | None = None
     share: float = 1.0
     calls: int = 0
@@ -194,18 +194,11 @@ class Sweep:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Sweep:
         """Read what `save` wrote. Raises: FileNotFoundError; ValueError for another file."""
-        content = json.loads(Path(path).read_text())
-        try:
-            rows = [Row(**row) for row in content["rows"]]
-            content = {name: content[name] for name in ("title", "scene", "reference", "environment")}
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{path} is not a sweep that kcam tradeoff wrote: {error}.") from error
-        rows = [replace(row, seconds_iqr=_pair(row.seconds_iqr)) for row in rows]
-        return cls(rows=tuple(rows), **content)
-
-
-def _pair(quartiles: Sequence[float] | None) -> tuple[float, float] | None:
-    return None if quartiles is None else (quartiles[0], quartiles[1])
+        wrong = f"{path} is not a sweep that kcam tradeoff wrote"
+        found: Sweep = from_json(Path(path).read_bytes(), cls, wrong=wrong)
+        if not any(row.default for row in found.rows):
+            raise ValueError(f"{wrong}: no row of it is the camera as it was given.")
+        return found
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
@@ -614,7 +607,7 @@ def _timed(every: Sequence[Setting], rows: list[Row], *, deadline: float, advanc
         replace(
             row,
             seconds=statistics.median(own),
-            seconds_iqr=_pair(np.percentile(own, [25, 75]).tolist()),
+            seconds_iqr=(float(np.percentile(own, 25)), float(np.percentile(own, 75))),
             calls=len(own),
         )
         if own

@@ -12,13 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
 from kcam import __version__, files, isp, plots, report, style
 from kcam.camera import Camera
+from kcam.plain import from_json
 from kcam.scene import Scene, read_picture
 from kcam.style.processes import place, told_by_the_first
 from kcam.threads import fixed, free_cores
@@ -248,7 +249,7 @@ def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> No
     found = folder / "config.json"
     if not found.exists() or not any((folder / "checkpoints").glob("step-*")):
         return
-    there = json.loads(found.read_text())
+    there = _config(found)
     if not resume:
         raise ValueError(f"{folder} holds a run. Go on with --resume, choose another --out, or remove the folder.")
     for name, value in document["options"].items():
@@ -260,11 +261,21 @@ def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> No
         raise ValueError(f"{document['options']['style']} is not the picture that {folder} was begun with.")
 
 
+class _Config(TypedDict):
+    options: dict[str, Any]
+    style: str
+    threads: int
+
+
+def _config(path: Path) -> _Config:
+    return from_json(path.read_bytes(), _Config, wrong=f"{path} is damaged", fix="Start the run anew.", hook=None)
+
+
 def _threads(folder: Path, resume: bool, threads: int | None) -> int:
     """How many a run computes with: as it began, for the last bit depends on it; else the cores that are free."""
     found = folder / "config.json"
     if threads is None and resume and found.exists():
-        return json.loads(found.read_text())["threads"]
+        return max(1, _config(found)["threads"])
     if threads is not None:
         if threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}.")

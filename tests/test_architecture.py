@@ -15,7 +15,7 @@ IDS = [str(path.relative_to(PACKAGE)) for path in FILES]
 # package. What stands in one row does not know of its neighbours.
 LAYERS = [
     {"kcam.threads"},
-    {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure"},
+    {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure", "kcam.plain", "kcam.layers"},
     {"kcam.context"},
     {"kcam.spectral", "kcam.files", "kcam.effects"},
     {"kcam.scene"},

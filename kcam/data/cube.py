@@ -15,7 +15,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import tifffile
@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from kcam.files import replacing
+from kcam.plain import from_json
 from kcam.units import WAVELENGTH_RANGE, nm, wavelength_grid
 
 SUFFIX = ".tif"
@@ -263,20 +264,30 @@ def is_cube(path: Path) -> bool:
         return False
 
 
+class _Version(TypedDict):
+    kcam_cube: int
+
+
+class _Document(_Version):
+    name: str
+    unit: str
+    wavelengths_nm: list[float]
+    extrapolated: list[bool]
+    source: dict[str, Any]
+
+
 def open_cube(path: Path) -> Source:
     """A cube file as a source: its strips are read from the disk when they are asked for."""
     with tifffile.TiffFile(path) as file:
         pages: list[Any] = list(file.pages)
-        try:
-            document = json.loads(pages[0].description)
-            version, name, unit = document["kcam_cube"], str(document["name"]), document["unit"]
-            grid = np.asarray(document["wavelengths_nm"], dtype=np.float64) * nm
-            extrapolated = np.asarray(document["extrapolated"], dtype=bool)
-            facts = dict(document["source"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise CubeError(f"its description is damaged: {error}.") from error
+        how: dict[str, Any] = {"wrong": "its description is damaged", "error": CubeError, "hook": None}
+        version = from_json(pages[0].description, _Version, **how)["kcam_cube"]
         if version != VERSION:
             raise CubeError(f"it is a cube of version {version}; this kcam reads {VERSION}.")
+        document: _Document = from_json(pages[0].description, _Document, **how)
+        name, unit, facts = document["name"], document["unit"], document["source"]
+        grid = np.asarray(document["wavelengths_nm"], dtype=np.float64) * nm
+        extrapolated = np.asarray(document["extrapolated"], dtype=bool)
         bands, (height, width) = len(grid), pages[0].shape[:2]
         if not bands <= len(pages) <= bands + 2 or len(extrapolated) != bands or unit not in UNITS:
             raise CubeError(f"it has {len(pages)} pages and {len(extrapolated)} marks for {bands} bands of {unit!r}.")

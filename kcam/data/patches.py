@@ -26,18 +26,20 @@ from dataclasses import asdict, dataclass, field
 from multiprocessing import active_children, connection, get_context, parent_process
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 from kcam import __version__
 from kcam.data.cube import NOTHING_VALID, SUFFIX, CubeError, Source, open_cube, words_of
 from kcam.files import replace, replacing
-from kcam.units import nm
+from kcam.plain import from_json
+from kcam.units import nm, wavelength_grid
 
 VERSION = 1
 TOP = 65535
 WORK = ".work"
+FILE = re.compile(r"scenes/[^/\\]+\.npy")
 _HEADER = 128  # bytes before the values of a .npy of this shape
 
 
@@ -416,11 +418,8 @@ def _check_folder(plan: StorePlan, out: Path, *, goes_on: bool) -> None:
     if found and not goes_on:
         raise StoreError(f"{out} is not empty; --resume goes on with it.")
     if begun.is_file():
-        try:
-            same = json.loads(begun.read_text())["hash"] == plan.hash
-        except (ValueError, KeyError, TypeError) as error:
-            raise StoreError(f"{begun} is damaged: {error}. Choose an empty folder.") from error
-        if not same:
+        how: dict[str, Any] = {"wrong": f"{begun} is damaged", "fix": "Choose an empty folder.", "error": StoreError}
+        if from_json(begun.read_bytes(), _Begun, **how)["hash"] != plan.hash:
             raise StoreError(f"{out} was begun with other cubes or settings. Use another folder, or the same ones.")
 
 
@@ -486,6 +485,7 @@ def work_on(job: SceneJob, settings: Settings, out: str) -> str | None:
     """
     try:
         record = extract_scene(job, settings, Path(out) / job.split / "scenes")
+        record["digest"] = _digest(record, without="digest")
         replace(Path(out) / WORK / "done" / f"{job.name}.json", json.dumps(record, sort_keys=True).encode())
     except (CubeError, StoreError) as error:
         return str(error)
@@ -502,11 +502,14 @@ def work_on(job: SceneJob, settings: Settings, out: str) -> str | None:
 
 def _done(job: SceneJob, settings: Settings, out: Path) -> dict[str, Any] | None:
     """The record of a scene that is done: it is whole, and its file has the right size."""
+    path = out / WORK / "done" / f"{job.name}.json"
     try:
-        record = json.loads((out / WORK / "done" / f"{job.name}.json").read_text())
+        record: dict[str, Any] = from_json(path.read_bytes(), _Done, wrong=f"{path} is damaged", hook=None)
+        if record["digest"] != _digest(record, without="digest"):
+            return None
         expected = _HEADER + record["count"] * job.shape[0] * settings.size**2 * 2
         return record if (out / job.split / record["file"]).stat().st_size == expected else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError):
         return None
 
 
@@ -551,7 +554,7 @@ def _manifest(plan: StorePlan, split: str, records: list[dict[str, Any]], failed
         squares += record["scale"] ** 2 * np.asarray(record["sum_of_squares"], dtype=np.float64)
     mean = total / max(pixels, 1)
     deviation = np.sqrt(np.maximum(squares / max(pixels, 1) - mean**2, 0))
-    hidden = ("sum", "sum_of_squares", "split")
+    hidden = ("sum", "sum_of_squares", "split", "digest")
     document = {
         "kcam_patches": VERSION,
         "kcam": __version__,
@@ -570,9 +573,9 @@ def _manifest(plan: StorePlan, split: str, records: list[dict[str, Any]], failed
     return (json.dumps(document | {"sha256": _digest(document)}, indent=1, sort_keys=True) + "\n").encode()
 
 
-def _digest(document: dict[str, Any]) -> str:
-    """Of a manifest without its own digest."""
-    own = {key: value for key, value in document.items() if key != "sha256"}
+def _digest(document: dict[str, Any], *, without: str = "sha256") -> str:
+    """Of a manifest, or a scene's record, without its own digest."""
+    own = {key: value for key, value in document.items() if key != without}
     return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
 
 
@@ -603,6 +606,60 @@ def _check_disk(plan: StorePlan, jobs: Sequence[SceneJob], out: Path) -> None:
 # ---- reading and checking ------------------------------------------------------------------------------------------
 
 
+class _Begun(TypedDict):
+    hash: str
+
+
+class _Record(TypedDict):
+    """What is known of a scene."""
+
+    scene: str
+    group: str
+    file: str
+    sha256: str
+    count: int
+    candidates: int
+    dropped: dict[str, int]
+    scale: float
+    positions: list[list[int]]
+    shape: list[int]
+    unit: str
+    extrapolated: list[int]
+    source: dict[str, Any]
+
+
+class _Done(_Record):
+    """And what only the manifest's sums need."""
+
+    split: str
+    sum: list[int]
+    sum_of_squares: list[int]
+    digest: str
+
+
+class _Shares(TypedDict):
+    split: tuple[tuple[str, float], ...]
+
+
+class _Version(TypedDict):
+    kcam_patches: int
+
+
+class _Manifest(_Version):
+    split: str
+    plan: str
+    settings: _Shares
+    wavelengths_nm: list[float]
+    dtype: str
+    patch: tuple[int, int, int]
+    patches: int
+    mean: list[float]
+    deviation: list[float]
+    failed: list[str]
+    scenes: list[_Record]
+    sha256: str
+
+
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of one split.
 
@@ -613,23 +670,26 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         splits = sorted(str(found.parent) for found in folder.glob(f"*/{MANIFEST}"))
         fix = f" Open one of its splits: {', '.join(splits)}." if splits else " Make one with extract_patches."
         raise FileNotFoundError(f"there is no {MANIFEST} in {folder}.{fix}")
+    held = path.read_bytes()
+    how: dict[str, Any] = {"wrong": f"{path} is damaged", "error": StoreError, "hook": None}
+    version = from_json(held, _Version, **how)["kcam_patches"]
+    if version != VERSION:
+        raise StoreError(f"{path} is of version {version}; this kcam reads {VERSION}.")
+    document: dict[str, Any] = from_json(held, _Manifest, **how)
+    bands, height, width = document["patch"]
+    curves = [len(document[name]) for name in ("wavelengths_nm", "mean", "deviation")]
+    if curves != [bands] * 3 or height != width or min(bands, width) < 1 or document["dtype"] != "<u2":
+        raise StoreError(f"{path} does not fit together.")
+    if document["sha256"] != _digest(document):
+        raise StoreError(f"{path} is not what was written: its own sha256 differs.")
     try:
-        document = json.loads(path.read_text())
-        if document["kcam_patches"] != VERSION:
-            raise StoreError(f"{path} is of version {document['kcam_patches']}; this kcam reads {VERSION}.")
-        bands, height, width = (int(size) for size in document["patch"])
-        if len(document["wavelengths_nm"]) != bands or height != width or document["dtype"] != "<u2":
-            raise StoreError(f"{path} does not fit together.")
-        if document["sha256"] != _digest(document):
-            raise StoreError(f"{path} is not what was written: its own sha256 differs.")
-        for record in document["scenes"]:
-            count, positions_, scale = record["count"], record["positions"], record["scale"]
-            if len(positions_) != count or not scale > 0 or not re.fullmatch(r"scenes/[^/\\]+\.npy", record["file"]):
-                raise StoreError(f"{path}: the entry of {record['scene']} does not fit together.")
-    except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, StoreError):
-            raise
-        raise StoreError(f"{path} is damaged: {error}.") from error
+        wavelength_grid([value * nm for value in document["wavelengths_nm"]])
+    except ValueError as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    for record in document["scenes"]:
+        lengths = [len(place) for place in record["positions"]]
+        if lengths != [2] * record["count"] or not 0 < record["scale"] < math.inf or not FILE.fullmatch(record["file"]):
+            raise StoreError(f"{path}: the entry of {record['scene']} does not fit together.")
     return document
 
 

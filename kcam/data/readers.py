@@ -89,11 +89,14 @@ def read_cube(
                bands: (L,) [m] that a photograph is upsampled to; None for 28 from 420 to 720 nm.
                depth: of a photograph, (H,W) [m].
     Returns:   a `Cube`, values float32.
-    Raises:    FileNotFoundError; CubeError for a file that is damaged, of another layout, or without wavelengths;
-               ValueError for an unknown format; ImportError for a format whose reader is not installed.
+    Raises:    FileNotFoundError; CubeError with its name for a file that is damaged, of another layout, or without
+               wavelengths; ValueError for an unknown format; ImportError for a format whose reader is not installed.
     """
     grids = [None if grid is None else wavelength_grid(grid).numpy() for grid in (wavelengths, bands)]
-    return open_source(Path(path), format=format, options=Options(grids[0], key, grids[1], depth)).cube()
+    try:
+        return open_source(Path(path), format=format, options=Options(grids[0], key, grids[1], depth)).cube()
+    except CubeError as error:
+        raise CubeError(f"{path}: {error}") from error
 
 
 def open_source(path: Path, *, format: str | None = None, options: Options | None = None) -> Source:

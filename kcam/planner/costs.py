@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from scipy.optimize import nnls
 
 from kcam import files, measure, optics
 from kcam.effects import Work
+from kcam.plain import from_json
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um
@@ -61,14 +62,17 @@ def rates_path() -> Path:
     return folder / "rates.json"
 
 
+class _Kept(TypedDict):
+    rates: dict[str, float]
+
+
 def current_rates() -> dict[str, float]:
     """This machine's rates where it was calibrated, else the defaults; a damaged file counts as none."""
     try:
-        kept = json.loads(rates_path().read_text())["rates"]
-        found = {kind: float(kept[kind]) for kind in RATES if kind in kept}
-    except (OSError, ValueError, KeyError, TypeError):
+        kept = from_json(rates_path().read_bytes(), _Kept, wrong=f"{rates_path()} is damaged")["rates"]
+    except (OSError, ValueError):
         return dict(RATES)
-    return RATES | {kind: rate for kind, rate in found.items() if 0 < rate < math.inf}
+    return RATES | {kind: float(rate) for kind, rate in kept.items() if kind in RATES and 0 < rate < math.inf}
 
 
 def save_rates(rates: Mapping[str, float]) -> Path:

@@ -6,7 +6,7 @@ import json
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from kcam import files
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context
 from kcam.optics import Imaging
+from kcam.plain import from_json
 from kcam.scene import Scene
 from kcam.sensor import ADC
 
@@ -171,26 +172,25 @@ class Plan:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"there is no file {path}. A plan is written by plan.save({str(path)!r}).")
-        try:
-            return cls.from_json(path.read_text())
-        except ValueError as error:
-            raise ValueError(f"{path} is not a plan that Plan.save wrote: {error}.") from error
+        return _read(path.read_bytes(), f"{path} is not a plan that Plan.save wrote")
 
     @classmethod
     def from_json(cls, text: str) -> Plan:
         """The plan that `to_json` wrote. Raises: ValueError for another text."""
-        try:
-            content = json.loads(text)
-            content["decisions"] = tuple(Decision(**row) for row in content["decisions"])
-            content["range"] = Range(**content["range"] | {"wavelengths": tuple(content["range"]["wavelengths"])})
-            content["changes"] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["changes"].items()}
-            content |= {key: tuple(content[key]) for key in ("skipped", "stages")}
-            return cls(**content)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{error!r}") from error
+        return _read(text, "the text is not a plan that Plan.to_json wrote")
 
     def __str__(self) -> str:
         return _table(self)
+
+
+def _read(text: str | bytes, wrong: str) -> Plan:
+    plan: Plan = from_json(text, Plan, wrong=wrong)
+    try:
+        if plan.measured and not {"error", "seconds", "reference_seconds"} <= plan.measured.keys():
+            raise ValueError("measured has no error, seconds or reference_seconds")
+        return replace(plan, changes=files.fitting_arguments(Imaging, plan.changes))
+    except ValueError as error:
+        raise ValueError(f"{wrong}: {error}.") from None
 
 
 class OutOfRange(UserWarning):

@@ -18,14 +18,15 @@ import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from kcam.style.plain import from_json, to_json
+from kcam.plain import from_json, to_json
 
 FORMAT = 1
 """Version of the layout: raised when an older kcam could no longer read what a newer one writes."""
@@ -45,8 +46,24 @@ class Checkpoint:
     best: bool
 
 
-class _Damaged(Exception):
+class _Damaged(ValueError):
     """A checkpoint is not what was written."""
+
+
+class _File(TypedDict):
+    size: int
+    sha256: str
+
+
+_Files = TypedDict("_Files", {"tensors.safetensors": _File, "state.json": _File})
+
+
+class _Manifest(TypedDict):
+    format: int
+    step: int
+    best: bool
+    files: _Files
+    sha256: str
 
 
 class Checkpoints:
@@ -172,16 +189,14 @@ class Checkpoints:
         shutil.rmtree(gone)
 
 
-def _manifest(path: Path, step: int) -> dict[str, Any]:
+def _manifest(path: Path, step: int) -> _Manifest:
     """The manifest of a checkpoint, which vouches for itself."""
     try:
-        manifest = from_json((path / MANIFEST).read_bytes())
-        own = manifest.pop("sha256")
+        held = (path / MANIFEST).read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         raise _Damaged(f"it has no {MANIFEST}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise _Damaged(f"its {MANIFEST} cannot be read") from None
-    if own != _sha256(to_json(manifest)):
+    manifest: _Manifest = from_json(held, _Manifest, wrong=f"its {MANIFEST} cannot be read", error=_Damaged)
+    if manifest["sha256"] != _sha256(to_json({key: value for key, value in manifest.items() if key != "sha256"})):
         raise _Damaged(f"its {MANIFEST} is not what was written")
     if manifest["format"] > FORMAT:
         raise ValueError(f"{path} has format {manifest['format']}; this kcam reads up to format {FORMAT}. Update kcam.")
@@ -192,8 +207,10 @@ def _manifest(path: Path, step: int) -> dict[str, Any]:
 
 def _read(path: Path, step: int) -> Checkpoint:
     manifest = _manifest(path, step)
-    held = {}
-    for name, expected in manifest["files"].items():
+    held: dict[str, bytes] = {}
+    files: Any = manifest["files"]
+    for name in _Files.__annotations__:
+        expected: _File = files[name]
         try:
             held[name] = (path / name).read_bytes()
         except FileNotFoundError:
@@ -202,8 +219,12 @@ def _read(path: Path, step: int) -> Checkpoint:
             raise _Damaged(f"its {name} has {len(held[name])} bytes of {expected['size']}")
         if _sha256(held[name]) != expected["sha256"]:
             raise _Damaged(f"its {name} is not what was written: its sha256 differs")
-    document = from_json(held["state.json"])
-    return Checkpoint(step, from_bytes(held["tensors.safetensors"]), document, path, manifest["best"])
+    document = from_json(held["state.json"], dict[str, Any], wrong="its state.json cannot be read", error=_Damaged)
+    try:
+        tensors = from_bytes(held["tensors.safetensors"])
+    except SafetensorError as error:
+        raise _Damaged(f"its tensors.safetensors cannot be read: {error}") from error
+    return Checkpoint(step, tensors, document, path, manifest["best"])
 
 
 def _tensors(tensors: Mapping[str, Tensor]) -> bytes:

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from kcam import isp, sensor
 from kcam.camera import Camera
 from kcam.isp.style_stage import LEAST_SHOWN
+from kcam.plain import fitting
 from kcam.planner import Plan
 from kcam.style.checkpoints import Checkpoints
 from kcam.style.draws import torch_generator
@@ -44,6 +45,21 @@ class StyleWarning(UserWarning):
 
 class TrainingError(RuntimeError):
     """Training cannot go on: at which step, by which term, on which scenes."""
+
+
+class _State(TypedDict):
+    """Of a checkpoint, what is no tensor."""
+
+    step: int
+    returns: int
+    slower: float
+    emphasis: float
+    lost: float
+    names: list[str]
+    advice: list[str]
+    optimiser: dict[str, Any]
+    plan: str | None
+    run: dict[str, Any]
 
 
 class Run:
@@ -277,15 +293,23 @@ class Run:
 
     def resume(self) -> None:
         found = None if self.checkpoints is None else self.checkpoints.latest()
-        state = None if found is None else {"tensors": found.tensors, "document": found.document}
-        state = told_by_the_first(state, self.world)
-        if state is None:
+        told = None if found is None else (str(found.path), {"tensors": found.tensors, "document": found.document})
+        told = told_by_the_first(told, self.world)
+        if told is None:
             return
-        there, here = state["document"]["run"], self._identity()
+        path, state = told
+        wrong = f"the checkpoint {path} is damaged"
+        try:
+            there, here = fitting(state["document"], _State)["run"], self._identity()
+        except ValueError as error:
+            raise ValueError(f"{wrong}: {error}.") from error
         for key, value in here.items():
             if there.get(key) != value:
                 raise ValueError(f"the checkpoint is of another run: {_difference(key, there.get(key), value)}")
-        self._restore(state)
+        try:
+            self._restore(state)
+        except Exception as error:  # of the right run and another content: torch says this in many ways
+            raise ValueError(f"{wrong}: {error}") from error
 
     def _restore(self, state: dict[str, Any]) -> None:
         tensors, document = state["tensors"], state["document"]

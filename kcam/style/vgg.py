@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -153,7 +152,7 @@ def _read(path: Path) -> Any:
     if path.suffix == ".safetensors":
         try:
             return load_file(path)
-        except SafetensorError as error:
+        except Exception as error:  # of a header that is no such thing, too
             raise ValueError(f"{path} is not a whole safetensors file ({error}). Get it again.") from error
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
