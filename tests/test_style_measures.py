@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -250,10 +249,3 @@ def test_a_blend_needs_a_style_that_covers_the_photograph(gravel):
     assert torch.equal(measures.blend(torch.zeros(3, 64, 70), gravel), gravel[:, :64, :70] / 2)
     with pytest.raises(ValueError, match=r"\(3, 60, 512\) must cover the photograph \(3, 64, 64\)"):
         measures.blend(torch.zeros(3, 64, 64), gravel[:, :60])
-
-
-def test_a_shot_is_measured_in_seconds(gravel):
-    photo, style, other = measures.photographs()["rocket"], gravel[:, :256, :256], gravel[:, 256:, 256:]
-    start = time.process_time()
-    measures.measure(photo, scene=photo, ordinary=photo, style=style, other_style=other)
-    assert time.process_time() - start < 6  # 1.1 s measured on one core; a busy one may be several times slower

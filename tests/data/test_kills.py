@@ -94,7 +94,7 @@ def test_sigkill_at_random_moments(tmp_path: Path, workers: int):
                 process.send_signal(signal.SIGKILL)  # the process alone: its workers must end by themselves
                 kills += 1
                 progress.add(len(list(out.glob(".work/done/*.json"))))
-            process.communicate(timeout=60)
+            process.communicate(timeout=300)
             assert not stores.left(process.pid), "workers outlive their parent"
             if process.returncode == 0 or kills == KILLS:
                 break

@@ -719,7 +719,7 @@ def test_ctrl_c_ends_in_one_line_and_resume_goes_on(tmp_path: Path, workers: int
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     else:
         process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert (out, err) == ("", "extract_patches.py: interrupted; --resume goes on.\n")
     assert not stores.left(process.pid)

@@ -504,7 +504,7 @@ def test_sigkill_at_random_moments(tmp_path: Path):
             wait_for_step(tmp_path / "run", int(line or 0) + 2, process)
             time.sleep(0.2 * draw.random())
             process.send_signal(signal.SIGKILL)
-            _, errors = process.communicate(timeout=60)
+            _, errors = process.communicate(timeout=300)
         began.append(int(line or -1))
         assert process.returncode == -signal.SIGKILL, errors
         met.update(re.sub("[0-9a-f]{8}$", "", name) for name in names(tmp_path / "run") if name.startswith("."))
