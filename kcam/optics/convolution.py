@@ -63,23 +63,19 @@ class Renderer:
         self.picture, self.border, self.direct, self.tile = picture, border, direct, tile
         self.max_memory, self.cache = max_memory, cache
         self.window = (psfs.shape[-2], psfs.shape[-1])
-        tiled = tile is not None and tile < max(picture)
-        part = (min(tile, picture[0]), min(tile, picture[1])) if tile is not None else picture
-        self.convolution = Convolution.of(
-            part,
-            self.window,
-            border="given" if tiled else border,
-            itemsize=psfs.element_size(),
-            max_memory=max_memory,
-            layers=psfs.shape[0],
-        )
+        self.convolution = self._convolution(border)
 
     def blur(self, planes: Tensor, *, layer: int) -> Tensor:
         """The scene's planes (B, K, H, W) through the PSFs of one layer: (B, C, H, W)."""
-        return self._tiles(planes, self._blur(self.psfs[layer]))
+        return self._tiles(planes, self._blur(self.psfs[layer]), self.convolution, self.border)
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
-        """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
+        """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W).
+
+        Where zeros lie beyond the picture it is dark there, not empty: what stands at the border goes on.
+        """
+        border = "replicate" if self.border == "zero" else self.border
+        convolution = self.convolution if border == self.border else self._convolution(border)
         psfs = self.psfs[layer]
         if self.weights is None:
             kernels = self._of_bands(psfs)
@@ -87,9 +83,23 @@ class Renderer:
             kernels = torch.einsum("cg,gyx->cyx", self._grouped(self.weights), psfs)
         kernels = kernels / kernels.sum((-2, -1), keepdim=True)
         if self.direct:
-            return correlate(extend(share, self.window, self.border), kernels[:, None])
-        transfers = self.convolution.transfer(kernels)
-        return self._tiles(share, lambda part: self.convolution.back(self.convolution.transform(part) * transfers))
+            return correlate(extend(share, self.window, border), kernels[:, None])
+        transfers = convolution.transfer(kernels)
+        return self._tiles(
+            share, lambda part: convolution.back(convolution.transform(part) * transfers), convolution, border
+        )
+
+    def _convolution(self, border: str) -> Convolution:
+        tile, picture = self.tile, self.picture
+        tiled = tile is not None and tile < max(picture)
+        return Convolution.of(
+            (min(tile, picture[0]), min(tile, picture[1])) if tile is not None else picture,
+            self.window,
+            border="given" if tiled else border,
+            itemsize=self.psfs.element_size(),
+            max_memory=self.max_memory,
+            layers=self.psfs.shape[0],
+        )
 
     def _of_bands(self, psfs: Tensor) -> Tensor:
         """The PSF of each band, (L, h, w)."""
@@ -102,13 +112,13 @@ class Renderer:
         sums = weights.new_zeros(*weights.shape[:-1], self.psfs.shape[1])
         return sums.index_add(-1, self.owner.to(weights.device), weights)
 
-    def _tiles(self, planes: Tensor, blur: Callable[[Tensor], Tensor]) -> Tensor:
+    def _tiles(self, planes: Tensor, blur: Callable[[Tensor], Tensor], convolution: Convolution, border: str) -> Tensor:
         """The picture in squares, each with what the window reaches around it; or whole."""
-        if self.direct or self.convolution.border != "given":
+        if self.direct or convolution.border != "given":
             return blur(planes)
-        (height, width), (rows, columns), (h, w) = self.picture, self.convolution.picture, self.window
+        (height, width), (rows, columns), (h, w) = self.picture, convolution.picture, self.window
         down, across = -(-height // rows), -(-width // columns)
-        extended = extend(planes, self.window, self.border)
+        extended = extend(planes, self.window, border)
         pad = (0, across * columns + w - 1 - extended.shape[-1], 0, down * rows + h - 1 - extended.shape[-2])
         extended = torch.nn.functional.pad(extended, pad)
         parts = [
@@ -287,11 +297,14 @@ def rendering_work(
         memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
         slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
         return Work({"product": float(summed * pixels * kernel * slow), "touch": touched}, memory)
-    transforms = tiles * (inputs + out) + kernels
+    transforms = float(tiles * (inputs + out) + kernels)
     touched = float(tiles * points * (inputs + out + products) + kernels * points) + mixed
     if coverage:
-        transforms += tiles * 2 * (1 + out) + out
-        touched += tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
+        beyond = "replicate" if border == "zero" else border
+        covering = Convolution.of(part, window, border=beyond, itemsize=itemsize, max_memory=max_memory)
+        ratio = covering.size[0] * covering.size[1] / points
+        transforms += ratio * (tiles * 2 * (1 + out) + out)
+        touched += ratio * tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
     memory = float(itemsize * (held * points + (inputs + out) * pixels))
     operations = {"transform": transforms * points * math.log2(max(2, points)), "touch": touched}
     if pixels > _CACHED:  # whole it is touched again and again in far memory, in tiles once

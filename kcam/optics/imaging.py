@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import inspect
 import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
 
 OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
+COVERAGES = ("channel", "band")
+_RANGE = 4000.0  # of light in one picture that float32's transforms hold to 1e-3; a picture of 8 bits has 3300
+_FEW_BRIGHT, _MUCH_DARK = 0.05, 0.01  # shares of the pixels
 _COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
 
 
@@ -49,8 +54,11 @@ class Imaging(Stage):
         bands: number of wavelengths that have a PSF of their own; None: all. Fewer: neighbouring bands share the PSF of
             their group's mean wavelength, whatever their number.
         psf_shape: (H, W) of the PSF's window in pixels; None: see `psf_window`.
-        layers: number of depth layers over the range of a depth map; None: see `depth_layers`.
+        layers: number of depth layers over the range of a depth map, at equal steps of 1/z, or their distances [m];
+            None: see `depth_layers`. Of given ones a warning says where pixels lie too far from all.
         interpolate: between the layers, linearly in vergence; False puts each pixel into its nearest layer.
+        coverage: where layers hide each other, count it per "channel" of the filter that is absorbed, or per "band":
+            the colours at an edge are then exact, at the cost of the bands.
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
         distance: of a plain tensor [m]; None: where the lens is focused.
         max_memory: bytes that the transforms may take; bands are split to stay below, with the same result.
@@ -62,9 +70,10 @@ class Imaging(Stage):
         renormalise: give a PSF that psf_shape cuts its whole light again.
         occlusion: False adds the layers up, also where a nearer one hides a farther one.
         rank: of the scene's spectra, at most, see `Scene.low_rank`; None for its own.
-        precision: "float32" computes so whatever the scene's type; None for the scene's.
-    Raises: ValueError for an unknown propagator, border or precision, a pitch not in metres, a shape or count that is
-        not positive, a kappa of 1 or less.
+        precision: "float32" computes so whatever the scene's type; None for the scene's, or float64 where its light
+            spans more than float32's transforms hold, see `wide_range`.
+    Raises: ValueError for an unknown propagator, border, coverage or precision, a pitch or distance not in metres, a
+        shape or count that is not positive, a kappa of 1 or less.
     """
 
     def __init__(
@@ -78,8 +87,9 @@ class Imaging(Stage):
         integrate: bool = True,
         bands: int | None = None,
         psf_shape: tuple[int, int] | None = None,
-        layers: int | None = None,
+        layers: int | Sequence[float] | Tensor | None = None,
         interpolate: bool = True,
+        coverage: str = "channel",
         border: str = "reflect",
         fill_factor: float = 1.0,
         distance: float | None = None,
@@ -100,8 +110,12 @@ class Imaging(Stage):
             raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
         if border not in BORDERS:
             raise ValueError(f"unknown border {border!r}; known: {', '.join(BORDERS)}.")
+        if coverage not in COVERAGES:
+            raise ValueError(f"unknown coverage {coverage!r}; known: {', '.join(COVERAGES)}.")
+        if layers is not None and not isinstance(layers, int):
+            layers = _distances(layers)
         for name, value, of in (
-            ("layers", layers, "depth layers"),
+            ("layers", layers if isinstance(layers, int) else None, "depth layers"),
             ("bands", bands, "wavelengths"),
             ("tile", tile, "pixels"),
             ("rank", rank, "factors"),
@@ -121,19 +135,26 @@ class Imaging(Stage):
         self.propagator, self.method, self.samples = propagator, method, samples
         self.psf_shape = None if psf_shape is None else (int(psf_shape[0]), int(psf_shape[1]))
         self.integrate, self.bands = integrate, bands
-        self.layers, self.interpolate, self.border, self.fill_factor = layers, interpolate, border, fill_factor
+        self.layers, self.interpolate, self.coverage = layers, interpolate, coverage
+        self.border, self.fill_factor = border, fill_factor
         self.distance, self.max_memory = distance, float(max_memory)
         self.tile, self.direct, self.blur, self.kappa, self.renormalise = tile, direct, blur, kappa, renormalise
         self.occlusion, self.rank, self.precision = occlusion, rank, precision
+        self._warns = True  # of too few layers
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
         query = self._query(wavelength_grid([550e-9]), torch.zeros(1), self.psf_shape or (1, 1), torch.empty(0))
         if method is not None:
             choose(query, propagator=propagator, method=method)  # refuses a method that does not exist
 
     def changed(self, **arguments: Any) -> Imaging:
-        """The same stage with some of its constructor's arguments changed; it shares the lens and has kept nothing."""
+        """The same stage with some of its constructor's arguments changed; it shares the lens and has kept nothing.
+
+        Of layers that are changed here no warning says that they are few: a plan has weighed what they cost.
+        """
         own = {name: getattr(self, name) for name in inspect.signature(Imaging).parameters}
-        return Imaging(**(own | arguments))
+        changed = Imaging(**(own | arguments))
+        changed._warns = self._warns and "layers" not in arguments
+        return changed
 
     def provides(self) -> dict[str, Any]:
         """The optics, for exposure in physical units."""
@@ -156,7 +177,7 @@ class Imaging(Stage):
         if self.rank is not None and self.rank < scene.coefficients.shape[1]:
             scene = scene.low_rank(self.rank)
         planes = scene.coefficients
-        working = self._working(planes)
+        working = self._working(scene)
         contraction = None if colour_filter is None else colour_filter.contraction(scene.wavelengths)
         with full_precision(working.device):
             result = self._render(scene, working, contraction).to(planes.dtype)
@@ -179,11 +200,12 @@ class Imaging(Stage):
         height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
         return height, width
 
-    def depth_layers(self, depth: Tensor, wavelengths: Tensor) -> Tensor:
-        """Vergences of the layers that a depth map is cut into, ascending (Z,) [1/m]: equal steps of <= 0.125 waves.
+    def depth_layers(self, depth: Tensor, wavelengths: Tensor, *, waves: float = LAYER_WAVES) -> Tensor:
+        """Vergences of the layers that a depth map is cut into, ascending (Z,) [1/m].
 
-        A step dV in vergence is a^2 dV / (2 lambda) waves of defocus at the rim. Their ends carry the gradient of the
-        map's nearest and farthest point; their number follows the map in steps.
+        Equal steps of at most `waves` of defocus, or the map's own distances where it has no more of them. A step dV in
+        vergence is a^2 dV / (2 lambda) waves at the rim. A map that requires grad is cut into equal steps always: their
+        ends carry the gradient of its nearest and farthest point. Their number follows the map in steps.
         """
         vergence = 1 / depth.to(torch.float64)
         if not self.blur:
@@ -192,14 +214,39 @@ class Imaging(Stage):
         span = float((high - low).detach())
         if span == 0:
             return vergence.mean()[None] if vergence.requires_grad else low[None]
+        if isinstance(self.layers, tuple):
+            return 1 / torch.tensor(self.layers, dtype=torch.float64, device=vergence.device)
         count = self.layers
         if count is None:
-            semi = float(self.lens.aperture.semi_aperture().detach())
-            count = 1 + math.ceil(span * semi**2 / (2 * float(wavelengths.min())) / LAYER_WAVES)
+            count = 1 + math.ceil(span * self._waves(wavelengths) / waves)
+            own = None if vergence.requires_grad else _few_values(vergence, at_most=count)
+            if own is not None:
+                return own
         if count == 1:
             return (low + high)[None] / 2
         share = torch.linspace(0, 1, count, dtype=torch.float64, device=vergence.device)
         return low + (high - low) * share
+
+    def _waves(self, wavelengths: Tensor) -> float:
+        """Of defocus at the rim for each unit of vergence, at most [m]."""
+        return float(self.lens.aperture.semi_aperture().detach()) ** 2 / (2 * float(wavelengths.min()))
+
+    def _check_layers(self, vergence: Tensor, layers: Tensor, wavelengths: Tensor) -> None:
+        """Warn where a pixel's distance is farther from all given layers than from the next of the rule's."""
+        if self.layers is None or not self._warns or not self.blur:
+            return
+        nodes, vergence = layers.detach(), vergence.detach().contiguous()
+        after = torch.searchsorted(nodes, vergence).clamp(max=len(nodes) - 1)
+        away = torch.minimum((nodes[after] - vergence).abs(), (vergence - nodes[(after - 1).clamp(min=0)]).abs())
+        worst = float(away.max()) * self._waves(wavelengths)
+        if worst > LAYER_WAVES / 2 * (1 + 1e-6):
+            distance = float(1 / vergence.flatten()[away.argmax()])
+            warnings.warn(
+                f"layers={self.layers} lie up to {worst:.3g} waves of defocus from the map's distances (at "
+                f"{distance:.4g} m), and {LAYER_WAVES / 2:g} keep its blur. Take layers=None, or give the distances "
+                f"that count, such as layers=({distance:.4g}, ...).",
+                stacklevel=2,
+            )
 
     # ---- scene and optics ------------------------------------------------------------------------------------------
 
@@ -290,16 +337,25 @@ class Imaging(Stage):
         pixel = (self.pixel_pitch, self.fill_factor)
         return (fingerprint(self.lens), how, pixel, wavelengths, vergences, shape, str(like.dtype), str(like.device))
 
-    def _working(self, planes: Tensor) -> Tensor:
-        """In the type that is computed in: at least float32."""
+    def _working(self, scene: Scene) -> Tensor:
+        """The scene's planes in the type that is computed in: at least float32."""
+        planes = scene.coefficients
         if self.precision is not None:
             return planes.to(getattr(torch, self.precision))
-        return planes if planes.dtype in (torch.float32, torch.float64) else planes.float()
+        if planes.dtype == torch.float64 or wide_range(scene):
+            return planes.double()
+        return planes.float()
+
+    def _vergences(self, scene: Scene, depth: Tensor) -> Tensor:
+        """Of the layers: half as far apart where a few lights stand out, whose own blur is seen, not its mean."""
+        fine = depth.numel() > 1 and wide_range(scene)
+        return self.depth_layers(depth, scene.wavelengths, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
 
     def _layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vergences of the layers in which there is anything, and the share of each pixel in them; None for one."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
-        vergences = self.depth_layers(depth, scene.wavelengths)
+        vergences = self._vergences(scene, depth)
+        self._check_layers(1 / depth, vergences, scene.wavelengths)
         if vergences.numel() == 1:
             return vergences, None
         shares = layer_shares(1 / depth, vergences, interpolate=self.interpolate).to(planes)
@@ -312,7 +368,7 @@ class Imaging(Stage):
 
     def work(self, scene: Scene, *, channels: int | None = None) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
-        planes = self._working(scene.coefficients)
+        planes = self._working(scene)
         batch, count, height, width = planes.shape
         bands, factored = scene.wavelengths.numel(), scene.spectra is not None
         low_rank = self.rank is not None and self.rank < count
@@ -323,6 +379,7 @@ class Imaging(Stage):
         vergences, _ = self._layers_of(scene, planes)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
+        channels = None if layers > 1 and self._per_band else channels
         grouped = self._psf_wavelengths(scene.wavelengths)
         groups = len(grouped)
         rendering = rendering_work(
@@ -367,6 +424,9 @@ class Imaging(Stage):
         spectra = None if scene.spectra is None else scene.spectra.to(planes)
         weights = None if contraction is None else contraction.to(planes)
         vergences, shares = self._layers_of(scene, planes)
+        afterwards = None
+        if shares is not None and self._per_band:
+            weights, afterwards = None, weights
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         length = self._layers_at_once(bands, window, planes)
         layers = Layers(planes, shares, occlusion=self.occlusion)
@@ -386,7 +446,67 @@ class Imaging(Stage):
                 cache=self._transfer_cache,
             )
             layers.add(renderer, first=start)
-        return layers.light
+        light = layers.light
+        if afterwards is not None:
+            light, weights = torch.einsum("cl,blyx->bcyx", afterwards, light), afterwards
+        return _not_negative(light, weights)
+
+    @property
+    def _per_band(self) -> bool:
+        return self.occlusion and self.coverage == "band"
+
+
+def wide_range(scene: Scene) -> bool:
+    """Whether the light of a picture spans more than float32's transforms hold: 4000 : 1 between what matters.
+
+    They err by about 1e-7 of the brightest, everywhere. That is 1e-3 of what is 4000 times darker, so the transforms
+    are float64 where a few lights stand out of the rest (fewer than 5 % of the pixels within 4000 of the brightest),
+    or where much is so dark (more than 1 % of what is not black). Black beside large bright areas is left to float32:
+    what comes there is off by up to 1e-6 of these. Pictures of 8 bits end at 3300 : 1.
+    """
+    planes = scene.coefficients.detach()
+    if not planes.numel():
+        return False
+    planes = planes if planes.dtype == torch.float64 else planes.float()
+    if scene.spectra is None:
+        light = planes.sum(1)
+    else:
+        light = torch.einsum("bkyx,k->byx", planes, scene.spectra.detach().to(planes).sum(1))
+    bright = light >= light.amax((1, 2), keepdim=True) / _RANGE
+    lit = (light > 0).float().mean((1, 2))
+    dark = lit - (bright & (light > 0)).float().mean((1, 2))
+    few = bright.float().mean((1, 2)) < _FEW_BRIGHT
+    return bool((few | (dark > _MUCH_DARK * lit)).any())
+
+
+def _not_negative(light: Tensor, weights: Tensor | None) -> Tensor:
+    """Irradiance (B, C, H, W) in which rounding took no pixel below 0, as none can be where the filter has no negative
+    weights; the gradient is that of what was computed.
+    """
+    below = light < 0
+    if weights is not None:
+        below = below & (weights.detach() >= 0).all(1)[:, None, None]
+    return torch.where(below, light - light.detach(), light)
+
+
+def _distances(layers: Sequence[float] | Tensor) -> tuple[float, ...]:
+    """Distances of layers [m] from far to near, each once."""
+    found = torch.as_tensor(layers, dtype=torch.float64).detach().flatten()
+    if not found.numel():
+        raise ValueError("layers holds no distance; give some, such as layers=(0.5, 2.0) in metres, a number, or None.")
+    for distance in found.tolist():
+        check_distances(distance)
+    return tuple(sorted(set(found.tolist()), reverse=True))
+
+
+def _few_values(values: Tensor, *, at_most: int) -> Tensor | None:
+    """The different values, ascending, or None where there are more of them."""
+    flat = values.flatten()
+    sample = flat[:: max(1, flat.numel() // 4096)]  # tells a ramp from planes without sorting all pixels
+    if sample.unique().numel() > at_most:
+        return None
+    found = flat.unique()
+    return found if found.numel() <= at_most else None
 
 
 def _map_work(query: Query) -> float:
@@ -400,11 +520,14 @@ def _map_work(query: Query) -> float:
 def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
     """Share of each pixel in each layer of a map: linear between neighbours, or all in the nearest.
 
-    Args:      vergence: (B, 1, H, W) [1/m]. layers: (Z,) in equal steps, ascending, Z > 1 [1/m].
+    Args:      vergence: (B, 1, H, W) [1/m]; beyond the layers all is in the last. layers: (Z,) ascending, Z > 1 [1/m].
     Returns:   (B, Z, H, W), sums to 1 over the layers.
     """
-    first, second = layers[:2].to(vergence.device)
-    position = (vergence - first) / (second - first)
+    layers = layers.to(vergence.device)
+    before = torch.searchsorted(layers.detach(), vergence.detach().contiguous(), right=True) - 1
+    before = before.clamp(0, layers.numel() - 2)
+    low, high = layers[before], layers[before + 1]
+    position = (before + (vergence - low) / (high - low)).clamp(0, layers.numel() - 1)
     position = position if interpolate else position.round()
     index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
     return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)

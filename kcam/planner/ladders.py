@@ -119,10 +119,10 @@ class _View:
 
     def __init__(self, trials: Trials, imaging: Imaging, scene: Scene) -> None:
         self.imaging, self.scene = imaging, scene
-        planes = imaging._working(scene.coefficients)
+        planes = imaging._working(scene)
         self.vergences, _ = imaging._layers_of(scene, planes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
-        self.layers = len(imaging.depth_layers(depth, scene.wavelengths)) if depth.numel() else 1
+        self.layers = len(imaging._vergences(scene, depth)) if depth.numel() else 1
         self.bands = min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
         ends = torch.stack([self.vergences.min(), self.vergences.max()])

@@ -1,0 +1,325 @@
+"""Layers of depth on scenes that are against them: lone points between two, colours that hide colours, few layers."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcam import Camera, optics
+from kcam.context import Context
+from kcam.optics.imaging import layer_shares
+from kcam.scene import Scene
+from kcam.sensor import ColourFilter
+from kcam.units import mm, um, wavelength_grid
+
+QUICK, ALL = range(3), range(3, 50)
+BANDS = 10
+
+
+class Draw:
+    """Seeded numbers."""
+
+    def __init__(self, seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def number(self, low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64))
+
+    def one_of(self, *choices):
+        return choices[int(torch.randint(len(choices), (), generator=self.generator))]
+
+    def noise(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator, dtype=torch.float64)
+
+    def lens(self, kind: str) -> optics.Lens:
+        """An ideal lens, a singlet whose colours are in focus at different distances, or that behind a rough DOE."""
+        focal = self.number(10, 50) * mm
+        glass: optics.Element = optics.ThinLens(focal)
+        if kind != "ideal":
+            name, index = self.one_of(("N-BK7", 1.517), ("N-SF11", 1.785))
+            glass = optics.PlanoConvexLens((index - 1) * focal, glass=name)
+        others = (optics.DOE(self.number(0, 12) * self.noise(24, 24)),) if kind == "rough" else ()
+        aperture = optics.CircularAperture(focal / self.number(6, 20))
+        return optics.Lens(aperture, glass, *others, focus_distance=self.one_of(0.5, 1.0, 2.0, 5.0))
+
+
+def largest(found: Tensor, truth: Tensor) -> float:
+    """Largest error, of the channel's largest value."""
+    return float(((found - truth).abs().amax((-2, -1)) / truth.amax((-2, -1))).max())
+
+
+# ---- between the layers ------------------------------------------------------------------------------------------
+
+
+def between_layers(seed: int, kind: str) -> tuple[float, float]:
+    """Largest error of (the channels, the bands) of light midway between two layers, of their largest value.
+
+    The map holds many distances: a dark strip at its lower edge, out of the window's reach, runs over half a wave.
+    """
+    draw = Draw(seed)
+    lens = draw.lens(draw.one_of("ideal", "singlet", "rough"))
+    semi = float(lens.aperture.semi_aperture())
+    wavelengths = wavelength_grid(count=BANDS)
+    distance = lens.query(wavelengths, distances=2.0, pixel_pitch=4 * um, shape=(1, 1)).sensor_distance
+    pitch = draw.number(0.4, 1.4) * float(distance) / (2 * semi) * 0.55 * um
+    stage = optics.Imaging(lens, pixel_pitch=pitch, border="zero", psf_shape=(25, 25))
+    step, steps = (0.125, 3) if kind != "lamp" else (0.0625, 5)
+    wave = 2 * float(wavelengths.min()) / semi**2
+    middle = max(1 / lens.focus_distance + draw.number(-3, 3) * wave, 0.3 * wave)
+    half = 0.499 * steps * step * wave
+    low, high = middle - half, middle + half
+    size = 44
+    vergence = torch.full((size, size), middle, dtype=torch.float64)
+    vergence[-2:] = torch.linspace(low, high, 2 * size, dtype=torch.float64).view(2, size)
+    light = torch.zeros(BANDS, size, size, dtype=torch.float64)
+    if kind == "noise":
+        light[:] = draw.noise(BANDS, size, size)
+    elif kind == "point":
+        light[:] = 0.001  # so that it is no lamp
+        light[:, 14, 20] = 1
+    else:
+        light[:] = 1e-5
+        light[:, 14, 20] = 1
+    light[:, -2:] = 0
+    scene = Scene.from_bands(light, wavelengths=wavelengths, depth=2.0)
+    mapped = scene.with_depth(1 / vergence[None, None])
+    errors = []
+    for colours in (ColourFilter.kodak(), None):
+        found, truth = (stage(s, colour_filter=colours)[..., :28, :] for s in (mapped, scene.with_depth(1 / middle)))
+        errors.append(largest(found, truth))
+    layers = stage._layers_of(mapped, mapped.coefficients)[0]
+    assert float(layers.diff().max()) / wave == pytest.approx(step, rel=0.01)
+    assert float((layers - middle).abs().min()) / wave == pytest.approx(step / 2, rel=0.01)
+    return errors[0], errors[1]
+
+
+BETWEEN = {"noise": (0.01, 0.02), "point": (0.08, 0.10), "lamp": (0.02, 0.025)}
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("kind", BETWEEN)
+def test_light_between_two_layers(kind: str, seed: int) -> None:
+    """At worst, midway, of the largest value: noise, a lone point, and a lamp, which has layers half as far apart."""
+    check_between(seed, kind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 40))
+@pytest.mark.parametrize("kind", BETWEEN)
+def test_light_between_two_layers_of_many_lenses(kind: str, seed: int) -> None:
+    check_between(seed, kind)
+
+
+def check_between(seed: int, kind: str) -> None:
+    channels, bands = between_layers(seed, kind)
+    print(f"{kind} {seed}: channels {channels:.4f}, bands {bands:.4f}")
+    assert channels < BETWEEN[kind][0]
+    assert bands < BETWEEN[kind][1]
+
+
+@pytest.mark.parametrize("border", optics.imaging.BORDERS)
+def test_two_layers_of_one_blur_are_one_convolution(border: str) -> None:
+    """Whatever the border: beyond zeros it is dark, and what is at the border does not shine to make up for it."""
+    scene = scene_of(2.0)
+    nearly = scene.with_depth(planes_of(2.0, 2.0 + 1e-7))
+    stage = imaging(border=border)
+    assert largest(stage(nearly), stage(scene)) < 1e-6
+
+
+# ---- distances ---------------------------------------------------------------------------------------------------
+
+
+def planes_of(*distances: float, size: int = 24, seed: int = 1) -> Tensor:
+    """A map of these distances, each somewhere."""
+    index = torch.randint(len(distances), (1, 1, size, size), generator=torch.Generator().manual_seed(seed))
+    index[0, 0, 0, : len(distances)] = torch.arange(len(distances))
+    return torch.tensor(distances, dtype=torch.float64)[index]
+
+
+def simple_lens() -> optics.Lens:
+    return optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
+
+
+def imaging(**arguments) -> optics.Imaging:
+    return optics.Imaging(simple_lens(), **({"pixel_pitch": 4 * um, "psf_shape": (21, 21)} | arguments))
+
+
+def scene_of(depth: float | Tensor, *, size: int = 24, bands: int = 3) -> Scene:
+    light = torch.rand(bands, size, size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    return Scene.from_bands(light, wavelengths=wavelength_grid(count=bands), depth=depth)
+
+
+@pytest.mark.parametrize("distances", [(0.7, 2.0), (0.7, 1.1, 5.0), (0.6, 0.9, 1.3, math.inf)])
+def test_few_distances_are_layers_of_their_own(distances: tuple[float, ...]) -> None:
+    """A map of objects on few planes is cut into these, and nothing is interpolated; said or found."""
+    scene = scene_of(planes_of(*distances))
+    stage = imaging()
+    layers = stage.depth_layers(scene.depth, scene.wavelengths)
+    assert torch.equal(layers, 1 / torch.tensor(sorted(distances, reverse=True), dtype=torch.float64))
+    for given in (distances, list(distances), torch.tensor(distances, dtype=torch.float64), distances * 2):
+        assert torch.equal(imaging(layers=given)(scene), stage(scene))
+    fine = imaging(layers=2000)(scene)  # 0.01 waves apart
+    assert float((stage(scene) - fine).abs().max() / fine.max()) < 2e-3
+
+
+def test_a_map_that_trains_is_cut_into_equal_steps() -> None:
+    depth = planes_of(0.7, 1.1, 5.0).requires_grad_()
+    layers = imaging().depth_layers(depth, wavelength_grid(count=3)).detach()
+    assert len(layers) > 3
+    torch.testing.assert_close(layers.diff(), layers.diff()[:1].expand(len(layers) - 1))
+
+
+def test_many_distances_are_equal_steps() -> None:
+    depth = 1 / torch.linspace(0.2, 1.4, 576, dtype=torch.float64).view(1, 1, 24, 24)
+    layers = imaging().depth_layers(depth, wavelength_grid(count=3))
+    assert (float(layers[0]), float(layers[-1])) == (pytest.approx(0.2), pytest.approx(1.4))
+    torch.testing.assert_close(layers.diff(), layers.diff()[:1].expand(len(layers) - 1))
+
+
+def test_shares_of_uneven_layers() -> None:
+    layers = torch.tensor([0.0, 0.1, 1.0], dtype=torch.float64)
+    vergence = torch.tensor([-1.0, 0.0, 0.05, 0.1, 0.325, 1.0, 2.0], dtype=torch.float64).view(1, 1, 1, 7)
+    expected = [[1, 1, 0.5, 0, 0, 0, 0], [0, 0, 0.5, 1, 0.75, 0, 0], [0, 0, 0, 0, 0.25, 1, 1]]
+    torch.testing.assert_close(layer_shares(vergence, layers)[0, :, 0], torch.tensor(expected, dtype=torch.float64))
+    nearest = layer_shares(vergence, layers, interpolate=False)[0, :, 0]
+    assert torch.equal(nearest.sum(0), torch.ones(7, dtype=torch.float64))
+    assert nearest[1].tolist() == [0, 0, 0, 1, 1, 0, 0] or nearest[1].tolist() == [0, 0, 1, 1, 1, 0, 0]
+    inner = torch.tensor([0.03, 0.07, 0.3, 0.8], dtype=torch.float64).view(1, 1, 2, 2).requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: layer_shares(v, layers), inner)
+
+
+@pytest.mark.parametrize(
+    ("layers", "few"),
+    [
+        (3, True),
+        (1, True),
+        (200, False),
+        (None, False),
+        ((0.7, 1.1, 5.0), False),
+        ((0.7, 5.0), True),
+        ((2.0,), True),
+        ((0.7, 1.1, 1.9, 5.0, math.inf), False),
+        ((1.1, 5.0), True),
+    ],
+)
+def test_too_few_layers_are_said(layers: int | tuple[float, ...] | None, few: bool) -> None:
+    """Of three distances: equal steps, that miss the middle one, and layers that leave one out or end before it."""
+    scene = scene_of(planes_of(0.7, 1.1, 5.0))
+    stage = imaging(layers=layers)
+    if few:
+        with pytest.warns(UserWarning, match=r"layers=.* lie up to .* waves of defocus from the map's distances \(at"):
+            stage(scene)
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            stage(scene)
+            imaging(layers=3).changed(layers=2)(scene)  # as a plan does, which has weighed it
+            imaging(layers=3, blur=False)(scene)
+
+
+@pytest.mark.parametrize("layers", [(0.7, 1.1, math.inf), 5, None])
+def test_distances_are_saved(tmp_path, layers: int | tuple[float, ...] | None) -> None:
+    Camera(imaging(layers=layers, coverage="band")).save(tmp_path / "camera.safetensors")
+    loaded = Camera.load(tmp_path / "camera.safetensors")[0]
+    assert loaded.coverage == "band"
+    scene = scene_of(planes_of(0.7, 1.1, 5.0))
+    assert torch.equal(loaded(scene), imaging(layers=layers)(scene))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"layers": ()}, r"layers holds no distance; give some, such as layers=\(0.5, 2.0\) in metres"),
+        ({"layers": (0.5, -1.0)}, "distance -1 is not a distance in front of the lens"),
+        ({"layers": (0.5, 0.0)}, "distance 0 is not a distance in front of the lens"),
+        ({"coverage": "wavelength"}, "unknown coverage 'wavelength'; known: channel, band"),
+    ],
+)
+def test_bad_layers_say_what_is_wrong(arguments: dict, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        imaging(**arguments)
+
+
+# ---- colours that hide colours -----------------------------------------------------------------------------------
+
+
+def colour_scene(draw: Draw, size: int = 32) -> tuple[str, Scene]:
+    """Colours before others: spectra that share no band, sRGB primaries, blocks, or each pixel by itself."""
+    kind = draw.one_of("bands", "line", "sRGB edge", "blocks", "random")
+    near, far = draw.number(0.45, 1.5), draw.number(1.5, 6)
+    left = (torch.arange(size) < size // 2).double()
+    edge = torch.where(left > 0, near, far).expand(1, 1, size, size)
+    index = torch.arange(28)
+    if kind in ("bands", "line"):
+        cut = 1 + draw.one_of(*range(26))
+        first = (index < cut) if kind == "bands" else (index == cut)
+        second = ~first if kind == "bands" else (index == draw.one_of(*range(28)))
+        first, second = (first, second) if draw.one_of(True, False) else (second, first)
+        light = first.double()[:, None, None] * left + second.double()[:, None, None] * (1 - left)
+        return kind, Scene.from_bands(light.expand(28, size, size), depth=edge)
+    if kind == "sRGB edge":
+        picture = torch.zeros(1, 3, size, size, dtype=torch.float64)
+        one, two = torch.randperm(3, generator=draw.generator)[:2].tolist()
+        picture[:, one], picture[:, two] = left, 1 - left
+        return kind, Scene.from_rgb(picture, depth=edge)
+    side = 1 if kind == "random" else draw.one_of(4, 8)
+    picture = draw.noise(1, 3, size // side, size // side)
+    picture = (picture > 0.5).double() if draw.one_of(True, False) else picture
+    places = 1 / far + (1 / near - 1 / far) * draw.noise(1, 1, size // side, size // side)
+    maps = (m.repeat_interleave(side, -1).repeat_interleave(side, -2) for m in (picture, places))
+    picture, places = maps
+    return kind, Scene.from_rgb(picture, depth=1 / places)
+
+
+COVERAGE = {"ideal": 0.06, "singlet": 0.25, "rough": 0.25}
+
+
+def check_coverage(seed: int, lens: str) -> None:
+    draw = Draw(seed)
+    kind, scene = colour_scene(draw)
+    colours = ColourFilter.kodak() if draw.one_of(True, False) else ColourFilter.learned(tile=4)
+    stage = optics.Imaging(draw.lens(lens), pixel_pitch=draw.one_of(2, 4, 6) * um, layers=4, psf_shape=(33, 33))
+    with torch.no_grad():
+        truth = colours(stage(scene), Context(wavelengths=scene.wavelengths))
+        channel, band = (stage.changed(coverage=c)(scene, colour_filter=colours) for c in ("channel", "band"))
+    error = float((channel - truth).abs().max() / truth.max())
+    print(f"{lens} {seed}: {kind}: {error:.4f}")
+    assert float((band - truth).abs().max() / truth.max()) < 1e-12
+    assert error < COVERAGE[lens]
+
+
+@pytest.mark.parametrize("seed", QUICK)
+@pytest.mark.parametrize("lens", COVERAGE)
+def test_colours_that_hide_colours(lens: str, seed: int) -> None:
+    """Per band it is the picture of all bands, filtered; per channel it is off by what a lens's own colours do."""
+    check_coverage(seed, lens)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", ALL)
+@pytest.mark.parametrize("lens", COVERAGE)
+def test_colours_that_hide_colours_in_many_scenes(lens: str, seed: int) -> None:
+    check_coverage(seed, lens)
+
+
+def test_coverage_per_band_is_priced() -> None:
+    scene = scene_of(planes_of(0.7, 1.1, 5.0), bands=28)
+    channel, band = (imaging(coverage=c).work(scene, channels=3) for c in ("channel", "band"))
+    assert band.operations["transform"] > 1.5 * channel.operations["transform"]
+    flat = scene.with_depth(2.0)
+    assert imaging(coverage="band").work(flat, channels=3) == imaging().work(flat, channels=3)
+
+
+def test_gradients_of_coverage_per_band() -> None:
+    scene = scene_of(planes_of(0.7, 1.1, size=4), size=4, bands=3)
+    colours = ColourFilter.kodak()
+    stage = imaging(coverage="band", psf_shape=(5, 5))
+
+    def picture(planes: Tensor) -> Tensor:
+        return stage(Scene(planes, wavelengths=scene.wavelengths, depth=scene.depth), colour_filter=colours)
+
+    assert torch.autograd.gradcheck(picture, scene.coefficients.clone().requires_grad_())
