@@ -1,66 +1,163 @@
-"""Results that are kept while what they were computed from has not changed - by value, so never stale."""
+"""Results that are kept while what they were computed from has not changed - by value, so never stale.
+
+What a value is, is decided here, once, for everything that a lens or a stage can hold (`value_of`):
+
+- numbers, text, None, dtypes and devices by type and bits, as are tensors and numpy arrays;
+- tuples, lists, dicts and sets by what is in them;
+- modules of kcam and torch.nn by their class and by all that they hold, plain attributes and torch's own alike;
+- kcam's functions by their code and what they closed over.
+
+What else there is cannot be known, and then nothing is kept and all is computed again: other objects and functions
+(hooks and methods put onto an instance among them), tensors of other kinds, parametrizations, which may draw, and
+modules of all other classes, whose methods may read a global, a closure or a file. Such a class may promise that they
+do not, see `optics.Element`. Nor is anything kept or used that a derivative passes through: of a graph, of forward
+mode, or of a transform of `torch.func`.
+
+Left to whoever does so: changing kcam's classes, functions and constants themselves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import types
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+_PLAIN = {type(None), bool, int, str, bytes, torch.dtype, torch.device, torch.layout, torch.memory_format}
+_CONTAINERS = {tuple, list, dict, OrderedDict, set, frozenset, torch.Size}
+_CODE = (types.FunctionType, property, classmethod, staticmethod)
+_IN_PYTHON = 1 << 9  # the flag of classes that are not compiled
+_INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
-def fingerprint(module: nn.Module) -> tuple[Any, ...]:
-    """Everything that a module's result can depend on: its parameters and buffers by value, and its plain attributes.
+class Unknown(Exception):
+    """Something is held whose value cannot be told."""
 
-    Version counters and addresses would be cheaper, but `.data`, `.to()`, a load or a copy change values behind them.
+
+def differentiated(tensor: Tensor) -> bool:
+    """Whether a derivative passes through a tensor: backwards by a graph, or forwards by a tangent."""
+    return tensor.requires_grad or _has_tangent(tensor)
+
+
+def _has_tangent(tensor: Tensor) -> bool:
+    return forward_ad.unpack_dual(tensor).tangent is not None
+
+
+def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ()) -> Any:
+    """What a thing is by value, to compare with `==`; its tensors come into `tensors`, to compare by their bits.
+
+    Raises: `Unknown` where that cannot be told.
     """
-    plain = tuple(
-        (name, key, value)
-        for name, part in module.named_modules()
-        for key, value in sorted(vars(part).items())
-        if key != "training" and isinstance(value, bool | int | float | str | tuple | None)
-    )
-    tensors = tuple(t.detach().clone() for t in (*module.parameters(), *module.buffers()))
-    return (plain, *tensors)
+    kind = type(thing)
+    if kind in _PLAIN:
+        return kind, thing
+    if kind in _CONTAINERS and not thing:  # most of what torch keeps in a module
+        return kind
+    if kind in (float, complex):
+        return kind, repr(thing)  # tells -0.0 from 0.0, and one NaN is the other
+    if isinstance(thing, Tensor):
+        usual = kind in (Tensor, nn.Parameter) and thing.layout is torch.strided and not thing.is_meta
+        if not usual or thing.is_nested or thing.is_quantized:
+            raise Unknown(f"a {kind.__name__} that is not plain")
+        tensors.append(thing)
+        return kind, thing.dtype, thing.device, thing.shape, thing.requires_grad
+    if id(thing) in within:
+        raise Unknown(f"a {kind.__name__} that holds itself")
+    within = (*within, id(thing))
+
+    def each(members: Iterable[Any]) -> list[Any]:
+        return [value_of(member, tensors, within=within) for member in members]
+
+    if kind in (dict, OrderedDict):
+        return kind, each(thing), each(thing.values())
+    if kind in (tuple, list, torch.Size):
+        return kind, each(thing)
+    if kind in (set, frozenset) and all(type(member) in _PLAIN for member in thing):
+        return kind, frozenset((type(member), member) for member in thing)
+    if isinstance(thing, nn.Module) or getattr(kind, "pure", False) is True:
+        code, data = _of_classes(kind)
+        return kind, code, each(data), list(vars(thing)), each(vars(thing).values())
+    if isinstance(thing, np.ndarray | np.generic) and kind.__module__ == "numpy" and not thing.dtype.hasobject:
+        return kind, thing.dtype, thing.shape, thing.tobytes()
+    if kind is types.FunctionType and thing.__globals__["__name__"].startswith("kcam."):
+        closed = [cell.cell_contents for cell in thing.__closure__ or ()]
+        return thing.__globals__["__name__"], thing.__code__, each((thing.__defaults__, thing.__kwdefaults__, closed))
+    if kind is ValueCache:
+        return kind
+    raise Unknown(kind.__name__)
+
+
+def _ours(cls: type) -> bool:
+    return cls.__module__.startswith(("kcam.", "torch.nn.modules."))
+
+
+def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
+    """Code, by identity, and data that instances have from classes of others, which must promise: see `Element`."""
+    code: list[Any] = []
+    data: list[Any] = []
+    others = [cls for cls in kind.__mro__[:-1] if not _ours(cls)]
+    if others and vars(kind).get("pure") is not True:
+        raise Unknown(f"{kind.__name__}, which promises nothing")
+    for cls in others:
+        if "__slots__" in vars(cls) or not cls.__flags__ & _IN_PYTHON:
+            raise Unknown(f"{cls.__name__}, which holds more than its attributes")
+        for name, value in vars(cls).items():
+            if isinstance(value, _CODE):
+                code.append(value)
+            elif not name.startswith("__"):
+                data += [name, value]
+    return code, data
 
 
 class ValueCache:
-    """One result and the values that it was computed from."""
+    """One tensor and the values that it was computed from."""
 
-    def __init__(self) -> None:
-        self._key: tuple[Any, ...] | None = None
-        self._value: Any = None
+    _kept: tuple[Any, tuple[Tensor, ...], Tensor] | None = None  # set and read at once: other threads use it too
 
-    def get(self, key: tuple[Any, ...], build: Callable[[], Any]) -> Any:
-        """The kept result if `key` (tensors and plain values) equals the kept one, else a new one.
+    def get(self, key: Any, build: Callable[[], Tensor]) -> Tensor:
+        """The kept result if `key`, of whatever it depends on, has the value of the kept one, else a new one.
 
-        Nothing that carries a graph is kept, nor mixed between inference mode and outside, where autograd refuses it.
+        It must not be changed in place. Inference mode has a result of its own, which autograd refuses outside.
         """
-        key = (*key, torch.is_inference_mode_enabled())
-        if self._key is not None and _equal(self._key, key):
-            return self._value
+        tensors: list[Tensor] = []
+        try:
+            if torch._C._are_functorch_transforms_active():  # even what is created inside is wrapped there
+                raise Unknown("a transform of torch.func")
+            modes = (torch.is_inference_mode_enabled(), torch.get_default_dtype(), torch.get_default_device())
+            key = (value_of(key, tensors), modes)
+        except Unknown:
+            return build()
+        if any(map(_recorded, tensors)):
+            return build()
+        kept = self._kept
+        if kept is not None and kept[0] == key and all(map(_same_bits, kept[1], tensors)):
+            return kept[2]
+        before = tuple(tensor.detach().clone() for tensor in tensors)
         value = build()
-        if not _carries_graph(value):
-            self._key, self._value = key, value
+        if type(value) is Tensor and not differentiated(value):
+            self._kept = key, before, value
         return value
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> ValueCache:
-        return ValueCache()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_key": None, "_value": None}
+    def __reduce__(self) -> tuple[type[ValueCache], tuple[()]]:
+        """A copy has kept nothing."""
+        return ValueCache, ()
 
 
-def _equal(a: Any, b: Any) -> bool:
-    if isinstance(a, Tensor) or isinstance(b, Tensor):
-        same_kind = isinstance(a, Tensor) and isinstance(b, Tensor) and a.device == b.device and a.dtype == b.dtype
-        return same_kind and a.shape == b.shape and bool(torch.equal(a, b))
-    if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b, strict=True))
-    return type(a) is type(b) and a == b
+def _recorded(tensor: Tensor) -> bool:
+    """Whether what is computed from a tensor now carries a derivative; no_grad stops graphs, but not tangents."""
+    return (tensor.requires_grad and torch.is_grad_enabled()) or _has_tangent(tensor)
 
 
-def _carries_graph(value: Any) -> bool:
-    if isinstance(value, Tensor):
-        return value.requires_grad
-    return isinstance(value, tuple | list) and any(_carries_graph(v) for v in value)
+def _same_bits(a: Tensor, b: Tensor) -> bool:
+    """Of tensors alike in type, shape and device; 0 is not -0, and a NaN is itself."""
+    return torch.equal(_bits(a), _bits(b))
+
+
+def _bits(tensor: Tensor) -> Tensor:
+    real = torch.view_as_real(tensor.resolve_conj()) if tensor.is_complex() else tensor
+    return real.detach().resolve_neg().view(_INTEGERS[real.element_size()])

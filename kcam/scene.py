@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam import spectral
+from kcam.cache import differentiated
 from kcam.precision import full_precision
 from kcam.units import check_distances, check_positive, wavelength_grid
 
@@ -390,7 +391,7 @@ def _product_range(planes: Tensor, spectra: Tensor, low: float, high: float) -> 
 
 
 def _depth_map(depth: float | Tensor, planes: Tensor) -> float | Tensor:
-    """A float, or a map (B,1,H,W) like the planes; a lone number that requires grad becomes a map of it."""
+    """A float, or a map (B,1,H,W) like the planes; a lone number with a derivative becomes a map of it."""
     if not isinstance(depth, (int, float, np.number, np.ndarray, Tensor)):
         raise TypeError(
             f"depth must be a number of metres or a tensor (B,1,H,W), got {type(depth).__name__} {depth!r}."
@@ -398,7 +399,7 @@ def _depth_map(depth: float | Tensor, planes: Tensor) -> float | Tensor:
     values = depth if isinstance(depth, Tensor) else torch.as_tensor(depth, dtype=torch.float64)
     if not (values > 0).all():
         check_distances(values, name="depth")
-    if values.ndim == 0 and not values.requires_grad:
+    if values.ndim == 0 and not differentiated(values):
         return float(values)
     batch, _, height, width = planes.shape
     if values.ndim and values.shape not in ((height, width), (1, 1, height, width), (batch, 1, height, width)):

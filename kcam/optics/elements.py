@@ -71,6 +71,12 @@ class Element(nn.Module):
 
     A subclass whose terms are rotationally symmetric says `symmetric = True` beside them: then a Hankel transform may
     take the place of the grid, and one quadrant that of four.
+
+    What the methods of one's own class read cannot be known, so PSFs of a lens that has one are computed anew for each
+    picture. A class that says `pure = True` in its own body promises that all its methods, inherited ones too, are a
+    function of their arguments and of what the element and its class hold (parameters, numbers, arrays, lists, modules
+    that are torch's or promise the same), that they read no global, file or clock, and draw nothing. PSFs are then kept
+    until something held has another value: see `kcam.cache`.
     """
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric

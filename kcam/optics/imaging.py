@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, fingerprint
+from kcam.cache import ValueCache, differentiated
 from kcam.context import Context, Stage
 from kcam.effects import Work
 from kcam.optics.convolution import BORDERS, Renderer, rendering_work
@@ -213,13 +213,13 @@ class Imaging(Stage):
         low, high = vergence.min(), vergence.max()
         span = float((high - low).detach())
         if span == 0:
-            return vergence.mean()[None] if vergence.requires_grad else low[None]
+            return vergence.mean()[None] if differentiated(vergence) else low[None]
         if isinstance(self.layers, tuple):
             return 1 / torch.tensor(self.layers, dtype=torch.float64, device=vergence.device)
         count = self.layers
         if count is None:
             count = 1 + math.ceil(span * self._waves(wavelengths) / waves)
-            own = None if vergence.requires_grad else _few_values(vergence, at_most=count)
+            own = None if differentiated(vergence) else _few_values(vergence, at_most=count)
             if own is not None:
                 return own
         if count == 1:
@@ -282,17 +282,17 @@ class Imaging(Stage):
             dtype=like.dtype,
             device=like.device,
         )
-        if vergences.requires_grad:  # not through 1 / distance, which has no slope at infinity
+        if differentiated(vergences):  # not through 1 / distance, which has no slope at infinity
             query = replace(query, vergences=vergences.to(query.device))
         return query if self.kappa is None else replace(query, kappa=self.kappa)
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the bands of a scene, (Z, L, h, w) in the dtype and on the device of `like`; kept while nothing
-        changes.
+        changes. The caller's own: it may be changed in place.
         """
         psfs = self._grouped_bank(wavelengths, vergences=vergences, shape=shape, like=like)
         owner = self._groups(wavelengths)
-        return psfs if owner is None else psfs[:, owner.to(psfs.device)]
+        return psfs.clone() if owner is None else psfs[:, owner.to(psfs.device)]
 
     def _groups(self, wavelengths: Tensor) -> Tensor | None:
         """Which PSF each band takes, (L,), where several take one; None where each has its own."""
@@ -327,15 +327,8 @@ class Imaging(Stage):
                 psfs = psfs / psfs.sum((-2, -1), keepdim=True) * whole
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.renormalise else psfs
 
-        trained = vergences.requires_grad or any(p.requires_grad for p in self.lens.parameters())
-        if torch.is_grad_enabled() and trained:
-            return build()
-        return self._bank_cache.get(self._optics_key(wavelengths, vergences.detach(), shape, like), build)
-
-    def _optics_key(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> tuple:
-        how = (self.propagator, self.method, self.samples, self.integrate, self.bands, self.kappa, self.renormalise)
-        pixel = (self.pixel_pitch, self.fill_factor)
-        return (fingerprint(self.lens), how, pixel, wavelengths, vergences, shape, str(like.dtype), str(like.device))
+        # the whole stage, lens and all: what the PSFs depend on is not listed by hand
+        return self._bank_cache.get((self, wavelengths, vergences, shape, like.dtype, like.device), build)
 
     def _working(self, scene: Scene) -> Tensor:
         """The scene's planes in the type that is computed in: at least float32."""

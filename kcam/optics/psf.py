@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from kcam.cache import differentiated
 from kcam.optics import sampling
 from kcam.optics.cells import Cells
 from kcam.optics.pixels import Pixels
@@ -183,7 +184,7 @@ def residual_path(query: Query, pupil: Pupil) -> tuple[Tensor, Tensor]:
         coefficients.append(ones)
         maps.append(pupil.beyond_paraxial(1 / query.sensor_distance))
         for index, vergence in enumerate(query.vergences):
-            if vergence.requires_grad or float(vergence) != 0:
+            if differentiated(vergence) or float(vergence) != 0:
                 coefficients.append(ones * (torch.arange(distances, device=query.device) == index))
                 maps.append(pupil.beyond_paraxial(vergence))
     for element in query.lens.elements:
