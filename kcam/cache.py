@@ -114,6 +114,38 @@ def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
     return code, data
 
 
+class Settings:
+    """What a module is at a time, beside what it trains: all that it holds, but for the values of what requires grad.
+
+    Of a part that cannot be known, itself and its own parts count: for decisions that a module's parts live on in.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        tensors: list[Tensor] = []
+        self.plain = (_settings_of(module, tensors), torch.is_grad_enabled())
+        self.tensors = tuple(tensor.detach().clone() for tensor in tensors if not tensor.requires_grad)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Settings) or self.plain != other.plain:
+            return False
+        return all(map(_same_bits, self.tensors, other.tensors))
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _settings_of(thing: Any, tensors: list[Tensor]) -> Any:
+    found: list[Tensor] = []
+    try:
+        value = value_of(thing, found)
+    except Unknown:
+        if not isinstance(thing, nn.Module):
+            return [thing]
+        own = {name: part for name, part in vars(thing).items() if name != "_modules"}
+        return thing, [_settings_of(part, tensors) for part in (*own.values(), *thing.children())]
+    tensors += found
+    return value
+
+
 class ValueCache:
     """One tensor and the values that it was computed from."""
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, wavelengths_of
 from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
 from kcam.augmentation.optics import LEAST_VERGENCE, finite_vergence
+from kcam.cache import Settings
 from kcam.camera import PRESETS, Camera
 from kcam.planner.making import check_tolerance
 from kcam.scene import Scene
@@ -33,7 +34,8 @@ class RandomCamera(CameraAugmentation):
 
     Each camera is planned once for each size of picture, on a fixed scene at both ends of the range of distances, never
     for a batch: the result for a sample does not depend on the others. With a map it is planned from infinity to the
-    near end of that range, or for a nearer map, to the next power of 2 [1/m] beyond its nearest point.
+    near end of that range, or for a nearer map, to the next power of 2 [1/m] beyond its nearest point. It is planned
+    again where it was changed in between, in anything but the values of what it trains.
 
     A PSF is no wider than the picture, as in any camera here: small pictures of things far out of focus get darker.
 
@@ -76,7 +78,7 @@ class RandomCamera(CameraAugmentation):
         names = (type(camera).__name__ if isinstance(camera, Camera) else str(camera) for camera in cameras)
         self.flags = {"cameras": "/".join(names), "tolerance": tolerance}
         self.wavelengths = None if wavelengths is None else wavelength_grid(wavelengths)
-        self._planned: dict[tuple[Any, ...], Camera] = {}
+        self._planned: dict[tuple[Any, ...], tuple[Settings, Camera]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Plans are made again after a copy: they refer to the cameras of the original."""
@@ -87,7 +89,8 @@ class RandomCamera(CameraAugmentation):
         return 3
 
     def planned(self, index: int, signal: Tensor, *, nearest: float | None = None) -> Camera:
-        """The camera that photographs such signals: with its plan for their size, made when it is first asked for.
+        """The camera that photographs such signals: with its plan for their size, made when it is first asked for, or
+        was changed since.
 
         nearest: the largest value of a map [1/m]; None without one.
         """
@@ -97,9 +100,10 @@ class RandomCamera(CameraAugmentation):
         if nearest is not None:
             beyond = 2.0 ** math.ceil(math.log2(nearest)) if nearest > near else 0.0
             near, far = max(near, beyond), 0.0
-        key = (index, shape, beyond, None if bands is None else tuple(bands.tolist()))
-        if key not in self._planned:
-            camera: Any = self.cameras[index]
+        key = (index, shape, beyond, self.tolerance, None if bands is None else tuple(bands.tolist()))
+        camera: Any = self.cameras[index]
+        settings = Settings(camera)
+        if key not in self._planned or self._planned[key][0] != settings:
             scene = Scene.builtin(_SCENE, shape, wavelengths=bands).to(device=signal.device)
             if nearest is not None:
                 ramp = torch.linspace(far, near, shape[1], dtype=torch.float64).clamp(min=LEAST_VERGENCE)
@@ -108,10 +112,10 @@ class RandomCamera(CameraAugmentation):
                 scenes = [scene.with_depth(1 / max(end, LEAST_VERGENCE)) for end in {near, far}]
             plan = camera.plan(scenes, tolerance=self.tolerance)
             # a plain camera: a PlannedCamera would warn of each picture that is not like the fixed scene
-            self._planned[key] = Camera(*plan.apply(camera), context=camera.resolve())
+            self._planned[key] = settings, Camera(*plan.apply(camera), context=camera.resolve())
         if len(self._planned) > _PLANS:  # of pictures of ever other sizes, the oldest goes
             del self._planned[next(iter(self._planned))]
-        return self._planned[key]
+        return self._planned[key][1]
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Row by row, each with its own camera, distance and seed."""

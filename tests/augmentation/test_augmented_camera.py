@@ -199,3 +199,53 @@ def test_bad_arguments() -> None:
         KC.RandomCamera([raw], 0)(picture(1, 3, 8, 8))
     with pytest.raises(ValueError, match="turns 28 channels into 3"):
         KC.RandomCamera(["ideal"], p=0.5)(picture(1, 28, 8, 8))
+
+
+def _pitch(camera: Camera) -> None:
+    camera[0].pixel_pitch = 2 * camera[0].pixel_pitch
+
+
+def _stage(camera: Camera) -> None:
+    camera.stages[1] = sensor.ColourFilter.kodak()
+
+
+def _added(camera: Camera) -> None:
+    camera[0].lens.elements.append(optics.Defocus(0.5))
+
+
+def _trained(camera: Camera) -> None:
+    camera.requires_grad_(True)
+
+
+class _Own(optics.Element):
+    """Of which nothing can be known."""
+
+
+@pytest.mark.parametrize(
+    ("change", "own"),  # own: with a part that is not known
+    [
+        (_pitch, True),
+        *(pytest.param(change, False, marks=pytest.mark.slow) for change in (_pitch, _stage, _added, _trained)),
+        *(pytest.param(change, True, marks=pytest.mark.slow) for change in (_stage, _added, _trained)),
+    ],
+)
+def test_it_plans_again_for_a_camera_that_was_changed(change, own: bool) -> None:
+    camera = small_camera()
+    if own:
+        camera[0].lens.elements.append(_Own())
+    augmentation, signal = KC.RandomCamera([camera]), photographs(1)
+    with torch.no_grad():
+        _, drawn = augmented(augmentation, signal)
+        change(camera)
+        found = augmentation.simulate(signal, drawn)
+        assert torch.equal(found, KC.RandomCamera([camera]).simulate(signal, drawn))
+
+
+def test_training_does_not_plan_again() -> None:
+    camera = small_camera()
+    camera.stages[1] = sensor.ColourFilter.kodak().trainable()
+    augmentation, signal = KC.RandomCamera([camera], tolerance=0.1), photographs(1)
+    with torch.no_grad():
+        before = augmentation.planned(0, signal)
+        camera[1].coefficients.mul_(1.01)
+        assert augmentation.planned(0, signal) is before
