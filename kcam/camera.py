@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from kcam import files, isp, optics, sensor
 from kcam.context import Context, Stage
+from kcam.inputs import band_remedy, check_bands, describe
 from kcam.scene import Scene
 from kcam.threads import no_more_than_free
 from kcam.units import mm, nm, um
@@ -121,14 +122,17 @@ class Camera(nn.Module):
         """
         if not isinstance(scene, (Scene, Tensor)):
             raise TypeError(
-                f"a camera takes a Scene or a tensor (B,L,H,W), got {type(scene).__name__}. "
-                "Use Scene.from_rgb(image, depth=2.0) or Scene.from_file(path, depth=2.0)."
+                f"a camera takes a Scene or a tensor (B,L,H,W), got {describe(scene)}. Use "
+                "Scene.from_rgb(image, depth=2.0) or Scene.from_file(path, depth=2.0)."
+                f"{band_remedy(scene, name='image', bands=len(self.resolve().wavelengths))}"
             )
         if not (generator is None or isinstance(generator, torch.Generator)):
             raise TypeError(
                 f"generator must be a torch.Generator, got {generator!r}. Use torch.Generator().manual_seed(0)."
             )
         context = self.resolve(scene, generator=generator)
+        if isinstance(scene, Tensor) and len(self) and isinstance(self[0], (optics.Imaging, sensor.ColourFilter)):
+            check_bands(scene, name="image", count=len(context.wavelengths), ndims=(4,), sure=False)
         signal: Any = scene
         stages = pairwise([*self, None])
         for stage, successor in stages:

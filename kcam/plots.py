@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam import files, optics, sensor, spectral
+from kcam.inputs import check_picture
 from kcam.sensor.mosaic import pattern_tile
 from kcam.tradeoff import Row, Sweep, front
 from kcam.units import nm, um
@@ -51,11 +52,8 @@ def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int
     Raises:    as `check_writable`; TypeError, ValueError for another shape, NaN, or values beyond -1..2.
     """
     check_writable(path)
+    check_picture(picture, name="picture", ndims=(3,), within=(-1.0, 2.0))
     image = as_image(picture)
-    low, high = (value.item() for value in picture.detach().aminmax())
-    if not (low >= -1 and high <= 2):
-        fix = "Remove the NaNs." if low != low else "Use picture / 255, or picture.clamp(0, 1)."
-        raise ValueError(f"picture has values from {low:g} to {high:g}, expected [0,1]. {fix}")
     suffix = Path(path).suffix.lower()
     options: dict[str, Any] = {"quality": quality} if suffix in {".jpg", ".jpeg", ".webp"} else {}
     content = io.BytesIO()
@@ -79,13 +77,7 @@ def figure_bytes(figure: Figure, *, resolution: float = 144, format: str = "png"
 
 def as_image(picture: Tensor) -> np.ndarray:
     """A picture (C,H,W), C = 1 or 3, as an array (H,W,3) in [0,1]. Raises: TypeError, ValueError for what is none."""
-    if not isinstance(picture, Tensor):
-        raise TypeError(f"a picture is a tensor (3,H,W) in [0,1], got {type(picture).__name__}.")
-    if picture.ndim != 3 or picture.shape[0] not in (1, 3) or 0 in picture.shape:
-        hint = {2: " Use picture[None].", 4: " Use picture[0]."}.get(picture.ndim, "")
-        if picture.ndim == 3 and picture.shape[-1] in (1, 3):
-            hint = " Use picture.permute(2, 0, 1)."
-        raise ValueError(f"a picture has shape (3,H,W) or (1,H,W), got {tuple(picture.shape)}.{hint}")
+    check_picture(picture, name="picture", ndims=(3,), within=None)
     image = picture.detach().float().clamp(0, 1).cpu().nan_to_num()
     return image.expand(3, -1, -1).permute(1, 2, 0).numpy()
 

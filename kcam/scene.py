@@ -7,9 +7,10 @@ pictures are (three planes and three spectra stand for 28 bands), and rendering 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -19,8 +20,9 @@ from torch.nn import functional as F
 
 from kcam import spectral
 from kcam.cache import differentiated
+from kcam.inputs import as_map, as_values, band_remedy, check_bands, check_picture, describe, remedy
 from kcam.precision import full_precision
-from kcam.units import check_distances, check_positive, wavelength_grid
+from kcam.units import LEAST_DISTANCE, check_distances, check_positive, wavelength_grid
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,8 +38,9 @@ class Scene:
     Args:      coefficients: (B,K,H,W); their dtype and device are the scene's.
                spectra: (K,L), the light included; None if the coefficients are the bands, K = L.
                wavelengths: (L,) [m], kept as float64 on the CPU; by default 28 from 420 to 720 nm.
-               depth: distance from the lens [m], inf allowed; a number, kept as a float, or a map (H,W), (1,1,H,W) or
-               (B,1,H,W), kept as the last.
+               depth: distance from the lens [m], inf allowed: a number, kept as a float; one for each sample, (B,),
+               also where B is H, kept so as float64 on the CPU; or a map (H,W), (1,H,W), (B,H,W), (1,1,H,W) or
+               (B,1,H,W), kept as the last. A lone number with a derivative becomes a map of it.
                illuminant: a name or (L,), see `spectral.illuminant`; kept as (L,) float64 on the CPU.
                luminance: of a perfect white [cd/m^2].
     Raises:    TypeError, ValueError for shapes that do not fit, integers, NaN or inf, negative radiance, depth <= 0.
@@ -46,21 +49,28 @@ class Scene:
     coefficients: Tensor
     spectra: Tensor | None = None
     wavelengths: Tensor = field(default_factory=wavelength_grid)
-    depth: float | Tensor = 2.0
+    depth: float | Tensor = 2.0  # numbers in a list or an array become one of these
     illuminant: Tensor = "D65"  # type: ignore[assignment]  # a name is replaced by its spectrum
     luminance: float = 1000.0
 
     def __post_init__(self) -> None:
         planes, spectra = self.coefficients, self.spectra
-        if not isinstance(planes, Tensor) or not planes.is_floating_point():
-            raise TypeError(f"coefficients must be a floating-point tensor (B,K,H,W), got {_describe(planes)}.")
-        if planes.ndim != 4 or 0 in planes.shape[1:]:
-            raise ValueError(f"coefficients have shape {tuple(planes.shape)}, expected (B,K,H,W) with K, H, W >= 1.")
         wavelengths = wavelength_grid(self.wavelengths)
-        bands, factors = len(wavelengths), planes.shape[1]
+        bands = len(wavelengths)
+        if not isinstance(planes, Tensor) or not planes.is_floating_point():
+            raise TypeError(
+                f"coefficients must be a floating-point tensor (B,K,H,W), got {describe(planes)}."
+                f"{band_remedy(planes, name='coefficients', bands=bands)}"
+            )
+        if planes.ndim != 4 or 0 in planes.shape[1:]:
+            raise ValueError(
+                f"coefficients have shape {tuple(planes.shape)}, expected (B,K,H,W) with K, H, W >= 1."
+                f"{'' if spectra is not None else band_remedy(planes, name='coefficients', bands=bands)}"
+            )
+        factors = planes.shape[1]
         if spectra is not None:
             if not isinstance(spectra, Tensor):
-                raise TypeError(f"spectra must be a tensor (K,L) or None, got {_describe(spectra)}.")
+                raise TypeError(f"spectra must be a tensor (K,L) or None, got {describe(spectra)}.")
             spectra = spectra.to(planes)
             if spectra.shape != (factors, bands):
                 raise ValueError(
@@ -70,6 +80,7 @@ class Scene:
         elif factors != bands:
             raise ValueError(
                 f"{factors} bands, but {bands} wavelengths: expected as many. Pass wavelengths= ({factors},) in metres."
+                f"{band_remedy(planes, name='coefficients', bands=bands)}"
             )
         _check_radiance(planes, spectra)
         check_positive(self.luminance, name="luminance", unit="cd/m^2")
@@ -99,24 +110,11 @@ class Scene:
 
         Args:      image: (3,H,W), (B,3,H,W), (1,H,W) or (B,1,H,W), sRGB in [0,1] as files have it (gamma-coded).
                    Others: as for `Scene`.
-        Raises:    TypeError for integers or what is no tensor; ValueError for another shape or values outside [0,1].
+        Raises:    TypeError for integers or what is no tensor; ValueError for another shape or values outside [0,1];
+                   with the code that makes it right.
         """
-        if not isinstance(image, Tensor) or not image.is_floating_point():
-            raise TypeError(f"image must be a floating-point tensor (3,H,W) in [0,1], got {_describe(image)}.")
-        shape = tuple(image.shape)
+        check_picture(image, name="image")
         image = image[None] if image.ndim == 3 else image
-        if image.ndim != 4 or image.shape[1] not in (1, 3):
-            hint = {
-                2: " Add the channel: image[None].",
-                3: " For (H,W,C) use image.permute(2, 0, 1).",
-                4: " For (B,H,W,C) use image.permute(0, 3, 1, 2).",
-            }.get(len(shape) if len(shape) == 2 or shape[-1:] in ((1,), (3,), (4,)) else 0, "")
-            raise ValueError(f"image has shape {shape}, expected 1 or 3 channels: (C,H,W) or (B,C,H,W).{hint}")
-        if image.numel():
-            low, high = (value.item() for value in image.detach().aminmax())
-            if not (low >= 0 and high <= 1):
-                fix = "Remove the NaNs." if low != low else "Use image / 255." if high > 2 else "Use image.clamp(0, 1)."
-                raise ValueError(f"image has values from {low:g} to {high:g}, expected sRGB in [0,1]. {fix}")
         channels = image.shape[1]
         linear = rgb_to_linear_rgb(image.expand(-1, 3, -1, -1))[:, :channels]
         grid = wavelength_grid(wavelengths)
@@ -145,12 +143,9 @@ class Scene:
                    tensor, the radiance of a perfect white in the unit of `bands`.
                    Others: as for `Scene`.
         """
-        if not isinstance(bands, Tensor):
-            raise TypeError(f"bands must be a floating-point tensor (L,H,W) or (B,L,H,W), got {_describe(bands)}.")
-        if bands.ndim not in (3, 4):
-            raise ValueError(f"bands have shape {tuple(bands.shape)}, expected (L,H,W) or (B,L,H,W).")
-        bands = bands[None] if bands.ndim == 3 else bands
         grid = wavelength_grid(wavelengths)
+        check_bands(bands, name="bands", count=len(grid), ndims=(3, 4))
+        bands = bands[None] if bands.ndim == 3 else bands
         light = spectral.illuminant(illuminant, wavelengths=grid)
         if isinstance(illuminant, Tensor):
             bands = bands * (light.sum() / illuminant.detach().double().cpu().sum()).item()
@@ -295,7 +290,7 @@ class Scene:
                 f"{full_height} x {full_width} pixels."
             )
         window = (..., slice(top, top + height), slice(left, left + width))
-        depth = self.depth[window] if isinstance(self.depth, Tensor) else self.depth
+        depth = self.depth[window] if _is_map(self.depth) else self.depth
         return replace(self, coefficients=self.coefficients[window], depth=depth)
 
     def __repr__(self) -> str:
@@ -324,6 +319,9 @@ def read_picture(path: str | os.PathLike[str]) -> Tensor:
     from kornia.io import ImageLoadType, load_image
     from PIL import Image
 
+    if not isinstance(path, (str, os.PathLike)):
+        code = f" What is no file goes to Scene.from_rgb.{remedy(path, name='image')}"
+        raise TypeError(f"path must be the name of a file, got {describe(path)}.{code}")
     path = Path(path)
     if not path.is_file():
         what = f"{path} is a folder" if path.is_dir() else f"there is no file {path}"
@@ -355,19 +353,6 @@ def read_picture(path: str | os.PathLike[str]) -> Tensor:
     return pixels.flip(flips)
 
 
-def _describe(value: object) -> str:
-    """What was given instead of a floating-point tensor, and the way out."""
-    if isinstance(value, Tensor):
-        scale = {torch.uint8: "255", torch.uint16: "65535"}.get(value.dtype)
-        fix = f". Use .float() / {scale}" if scale else ". Use .float()" if not value.is_floating_point() else ""
-        return f"a tensor {tuple(value.shape)} of {value.dtype}{fix}"
-    if isinstance(value, np.ndarray):
-        order = ".permute(2, 0, 1)" if value.ndim == 3 and value.shape[-1] in (1, 3, 4) else ""
-        scale = {"uint8": " / 255", "uint16": ".float() / 65535"}.get(value.dtype.name, ".float()")
-        return f"an array {value.shape} of {value.dtype}. Use torch.from_numpy(image){order}{scale}"
-    return f"{type(value).__name__}"
-
-
 def _check_radiance(planes: Tensor, spectra: Tensor | None) -> None:
     if not planes.numel():
         return
@@ -378,7 +363,8 @@ def _check_radiance(planes: Tensor, spectra: Tensor | None) -> None:
         raise ValueError(f"the radiance runs from {low:g} to {high:g}, expected finite values. Remove NaN and inf.")
     # A factored cube may dip below zero by the error of its factorisation: a thousandth of the brightest is let pass.
     if low < (0 if spectra is None else -1e-3 * high):
-        raise ValueError(f"the radiance goes down to {low:g}, but light is not negative. Use .clamp(min=0).")
+        fix = "Undo what was subtracted from it, such as bands * std + mean; or use" if low < -0.1 * high else "Use"
+        raise ValueError(f"the radiance goes down to {low:g}, but light is not negative. {fix} .clamp(min=0).")
 
 
 def _product_range(planes: Tensor, spectra: Tensor, low: float, high: float) -> tuple[float, float]:
@@ -390,24 +376,24 @@ def _product_range(planes: Tensor, spectra: Tensor, low: float, high: float) -> 
     return min(pair.min.item() for pair in ranges), max(pair.max.item() for pair in ranges)
 
 
-def _depth_map(depth: float | Tensor, planes: Tensor) -> float | Tensor:
-    """A float, or a map (B,1,H,W) like the planes; a lone number with a derivative becomes a map of it."""
-    if not isinstance(depth, (int, float, np.number, np.ndarray, Tensor)):
-        raise TypeError(
-            f"depth must be a number of metres or a tensor (B,1,H,W), got {type(depth).__name__} {depth!r}."
-        )
-    values = depth if isinstance(depth, Tensor) else torch.as_tensor(depth, dtype=torch.float64)
-    if not (values > 0).all():
+def _depth_map(depth: float | Sequence[float] | Tensor, planes: Tensor) -> float | Tensor:
+    """A float, one number per sample (B,), or a map (B,1,H,W) like the planes, as `Scene` says."""
+    values = as_values(depth, name="depth", unit="m")
+    if not (values >= LEAST_DISTANCE).all():
         check_distances(values, name="depth")
-    if values.ndim == 0 and not differentiated(values):
-        return float(values)
     batch, _, height, width = planes.shape
-    if values.ndim and values.shape not in ((height, width), (1, 1, height, width), (batch, 1, height, width)):
-        raise ValueError(
-            f"depth has shape {tuple(values.shape)}, expected a number, ({height}, {width}) or "
-            f"({batch}, 1, {height}, {width}), as the picture."
-        )
-    return values.to(planes).expand(batch, 1, height, width)
+    values = as_map(values, shape=(batch, height, width), name="depth")
+    if values.ndim == 4:
+        return values.to(planes)
+    if values.ndim == 0 and differentiated(values):
+        return values.to(planes).expand(batch, 1, height, width)
+    if values.numel() == 1 and not differentiated(values):
+        return float(values)
+    return values.to("cpu", torch.float64)
+
+
+def _is_map(depth: float | Tensor) -> TypeGuard[Tensor]:
+    return isinstance(depth, Tensor) and depth.ndim == 4
 
 
 def _target_shape(size: int | tuple[int, int] | None, shape: tuple[int, int]) -> tuple[int, int]:
@@ -432,7 +418,7 @@ def _resized(scene: Scene, shape: tuple[int, int]) -> Scene:
     scene = scene.crop(top=(height - window[0]) // 2, left=(width - window[1]) // 2, height=window[0], width=window[1])
     planes = F.interpolate(scene.coefficients, shape, mode="bilinear", antialias=True)
     depth = scene.depth
-    if isinstance(depth, Tensor):
+    if _is_map(depth):
         depth = F.interpolate(depth, shape, mode="nearest-exact")
     return replace(scene, coefficients=planes, depth=depth)
 

@@ -16,7 +16,7 @@ IDS = [str(path.relative_to(PACKAGE)) for path in FILES]
 LAYERS = [
     {"kcam.threads"},
     {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure", "kcam.plain", "kcam.layers"},
-    {"kcam.context"},
+    {"kcam.context", "kcam.inputs"},
     {"kcam.spectral", "kcam.files", "kcam.effects"},
     {"kcam.scene"},
     {"kcam.optics"},

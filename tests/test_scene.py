@@ -77,38 +77,36 @@ class TestFromRgb:
     def test_wrong_type(self) -> None:
         array = np.zeros((4, 5, 3), np.uint8)
         with pytest.raises(
-            TypeError, match=r"got an array \(4, 5, 3\) of uint8. Use torch.from_numpy\(image\).permute"
+            TypeError, match=r"got an array \(4, 5, 3\) of uint8. .* use torch.from_numpy\(image\).permute"
         ):
             Scene.from_rgb(array)
         with pytest.raises(
-            TypeError, match=r"in \[0,1\], got a tensor \(3, 4, 5\) of torch.uint8. Use .float\(\) / 255"
+            TypeError, match=r"in \[0,1\], got a tensor \(3, 4, 5\) of torch.uint8. Use image.float\(\)"
         ):
             Scene.from_rgb(torch.zeros(3, 4, 5, dtype=torch.uint8))
-        with pytest.raises(TypeError, match=r"of torch.uint16. Use .float\(\) / 65535"):
+        with pytest.raises(TypeError, match=r"of torch.uint16. Use image.float\(\) / 65535"):
             Scene.from_rgb(torch.zeros(3, 4, 5, dtype=torch.uint16))
-        with pytest.raises(TypeError, match=r"of torch.int64. Use .float\(\)"):
+        with pytest.raises(TypeError, match=r"of torch.int64. Use image.float\(\)"):
             Scene.from_rgb(torch.zeros(3, 4, 5, dtype=torch.int64))
         with pytest.raises(TypeError, match="got str"):
             Scene.from_rgb("photo.jpg")
 
     def test_wrong_shape(self) -> None:
         with pytest.raises(
-            ValueError, match=r"shape \(4, 5, 3\), expected 1 or 3 channels.*For \(H,W,C\) use image.per"
+            ValueError, match=r"shape \(4, 5, 3\), expected 1 or 3 channels.*channels last: use image.per"
         ):
             Scene.from_rgb(torch.zeros(4, 5, 3))
-        with pytest.raises(
-            ValueError, match=r"shape \(4, 5\), expected 1 or 3 channels.*Add the channel: image\[None\]"
-        ):
+        with pytest.raises(ValueError, match=r"shape \(4, 5\), expected 1 or 3 channels.*Use image\[None\]"):
             Scene.from_rgb(torch.zeros(4, 5))
         with pytest.raises(
             ValueError, match=r"shape \(2, 4, 5, 6\), expected 1 or 3 channels: \(C,H,W\) or \(B,C,H,W\)"
         ):
             Scene.from_rgb(torch.zeros(2, 4, 5, 6))
-        with pytest.raises(ValueError, match=r"shape \(2, 4, 5, 3\).*For \(B,H,W,C\) use image.permute\(0, 3, 1, 2\)"):
+        with pytest.raises(ValueError, match=r"shape \(2, 4, 5, 3\).*channels last: use image.permute\(0, 3, 1, 2\)"):
             Scene.from_rgb(torch.zeros(2, 4, 5, 3))
         with pytest.raises(ValueError, match=r"shape \(\), expected 1 or 3 channels"):
             Scene.from_rgb(torch.tensor(1.0))
-        with pytest.raises(ValueError, match=r"expected \(B,K,H,W\) with K, H, W >= 1"):
+        with pytest.raises(ValueError, match=r"image has shape \(3, 0, 5\), expected 1 or 3 channels"):
             Scene.from_rgb(torch.zeros(3, 0, 5))
 
     @pytest.mark.parametrize(
@@ -117,7 +115,7 @@ class TestFromRgb:
             (200.0, r"values from 0 to 200, expected sRGB in \[0,1\]. Use image / 255"),
             (1.2, r"values from 0 to 1.2, expected sRGB in \[0,1\]. Use image.clamp\(0, 1\)"),
             (-0.1, r"values from -0.1 to 0, expected.*clamp"),
-            (nan, "values from nan to nan, expected.*Remove the NaNs"),
+            (nan, "values from nan to nan, expected.*Remove NaN"),
             (inf, "values from 0 to inf, expected"),
         ],
     )
@@ -154,7 +152,7 @@ class TestFromBands:
 
     def test_errors(self) -> None:
         with pytest.raises(
-            ValueError, match=r"31 bands, but 28 wavelengths: expected as many. Pass wavelengths= \(31,\)"
+            ValueError, match=r"shape \(31, 4, 5\), expected .* 28 bands, .* Scene.from_bands\(bands, wavelengths="
         ):
             Scene.from_bands(torch.zeros(31, 4, 5))
         with pytest.raises(ValueError, match=r"bands have shape \(4, 5\), expected \(L,H,W\) or \(B,L,H,W\)"):
@@ -163,9 +161,12 @@ class TestFromBands:
             TypeError, match=r"bands must be a floating-point tensor.*got an array \(28, 4, 5\) of uint16"
         ):
             Scene.from_bands(np.zeros((28, 4, 5), np.uint16))
-        with pytest.raises(TypeError, match=r"got a tensor \(1, 28, 4, 5\) of torch.uint8"):
+        with pytest.raises(TypeError, match=r"got a tensor \(28, 4, 5\) of torch.uint8"):
             Scene.from_bands(torch.zeros(28, 4, 5, dtype=torch.uint8))
-        for bad, text in ((-1.0, r"goes down to -1, but light is not negative. Use .clamp\(min=0\)"), (nan, "finite")):
+        for bad, text in (
+            (-1.0, r"goes down to -1, .* not negative. .* std .* use .clamp\(min=0\)"),
+            (nan, "finite"),
+        ):
             cube = torch.zeros(28, 4, 5)
             cube[3, 2, 1] = bad
             with pytest.raises(ValueError, match=text):
@@ -253,7 +254,7 @@ class TestScene:
 
     def test_errors(self) -> None:
         planes, spectra = torch.ones(1, 3, 4, 5), torch.ones(3, 28)
-        with pytest.raises(TypeError, match=r"coefficients must be a floating-point tensor \(B,K,H,W\), got list"):
+        with pytest.raises(TypeError, match=r"coefficients must be a .* \(B,K,H,W\), got a list of 1"):
             Scene([1.0])
         with pytest.raises(ValueError, match=r"coefficients have shape \(3, 4, 5\), expected \(B,K,H,W\)"):
             Scene(planes[0], spectra)
@@ -338,10 +339,10 @@ class TestDepth:
             for depth in (bad, torch.tensor([[bad]]).expand(4, 5)):
                 with pytest.raises(ValueError, match=rf"depth {bad:g} is not a distance in front of the lens"):
                     Scene.from_rgb(image, depth=depth)
-        for shape in ((5, 4), (3, 1, 4, 5), (1, 4, 5), (2, 3, 4, 5), (1,)):
-            with pytest.raises(ValueError, match=r"depth has shape .*, expected a number, \(4, 5\) or \(2, 1, 4, 5\)"):
+        for shape in ((5, 4), (3, 1, 4, 5), (2, 3, 4, 5), (3,)):
+            with pytest.raises(ValueError, match=r"depth has shape .* a map \(4, 5\) or \(2, 1, 4, 5\)"):
                 Scene.from_rgb(image, depth=torch.ones(shape))
-        with pytest.raises(TypeError, match=r"depth must be a number of metres or a tensor \(B,1,H,W\), got str '2 m'"):
+        with pytest.raises(TypeError, match=r"depth must be a number \[m\], one per sample \(B,\), .* got str '2 m'"):
             Scene.from_rgb(image, depth="2 m")
 
 

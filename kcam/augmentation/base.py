@@ -19,6 +19,7 @@ from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
 
 from kcam.augmentation.draws import Draw, Draws
+from kcam.inputs import ALPHA, as_map, as_values, channels_last, check_floats, remedy, scale_remedy
 from kcam.isp import tone_curve
 from kcam.precision import full_precision
 from kcam.units import nm, wavelength_grid
@@ -27,8 +28,11 @@ RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
 """Dominant wavelengths of the primaries of sRGB, seen against its white (from CIE 1931 chromaticities)."""
 
 
-_LARGEST = 2.5
-"""Of a picture: some above 1 come from other augmentations, and are white; from here on it is another scale."""
+TAKES = "(B,C,H,W), a picture in [0,1] or a cube"
+_LEAST, _LARGEST = -0.5, 2.5
+"""Of a picture: some beyond 0 and 1 come from other augmentations; from here on it is another scale."""
+_NEGATIVE = 0.1
+"""Of the largest value of a cube: light is not negative but by interpolation and noise."""
 
 
 def is_picture(signal: Tensor) -> bool:
@@ -79,18 +83,78 @@ def check_probability(p: float) -> None:
         raise ValueError(f"p must be a probability from 0 to 1, got {p:g}.")
 
 
-def check_values(signal: Tensor, *, picture: bool) -> None:
-    """ValueError for NaN or infinity, which a blur would spread over all, and for a picture of 0..255."""
+def check_values(signal: Tensor, *, picture: bool, linear: bool = False) -> None:
+    """ValueError for NaN or infinity, which a blur would spread over all, and for a picture or cube on another scale.
+
+    linear: of a sensor, whose noise may lie as far below 0 as above.
+    """
     if torch.compiler.is_compiling():
         return
     low, high = (float(value) for value in signal.detach().aminmax())
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(f"the input has values from {low:g} to {high:g}, expected finite ones. Remove NaN and inf.")
-    if picture and high > _LARGEST:
+    if picture and (high > _LARGEST or low < _LEAST):
+        fix = scale_remedy(low, high, name="image")
+        raise ValueError(f"the picture has values from {low:g} to {high:g}, expected sRGB in [0,1].{fix}")
+    if not (picture or linear) and low < min(_LEAST, -_NEGATIVE * high):
         raise ValueError(
-            f"the picture has values up to {high:g}, expected sRGB in [0,1]. Use image / "
-            f"{255 if high < 256 else 65535}."
+            f"the cube has values from {low:g} to {high:g}, but light is not negative. Use image * std + mean if it is "
+            "normalised by mean and deviation, or image.clamp(min=0)."
         )
+
+
+def check_layout(input: Tensor, *, wavelengths: Tensor | None = None, alpha: bool = False) -> None:
+    """ValueError for a tensor that is neither a picture nor a cube (..., C, H, W): channels last, with alpha, clips.
+
+    Args:      wavelengths: where there is one for each channel, it is a cube.  alpha: whether it may be there.
+    """
+    shape = tuple(input.shape)
+    if 2 <= len(shape) <= 4 and (len(shape) == 2 or is_picture(input)):
+        return
+    known = wavelengths is not None and len(wavelengths) == shape[-3]
+    if len(shape) not in (3, 4) or (not known and (channels_last(shape) or (shape[-3] == ALPHA and not alpha))):
+        fix = remedy(input, name="image", channels=(1, 3, ALPHA) if alpha else (1, 3), scaled=False)
+        bands = (
+            f" If these are {shape[-3]} bands, give a CameraSequential their wavelengths=." if len(shape) > 2 else ""
+        )
+        raise ValueError(
+            f"the input has shape {shape}, expected (B,C,H,W): a picture of 3 channels, or 1 if gray, or a cube."
+            f"{fix}{bands}"
+        )
+
+
+def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:
+    """A map of inverse depth as (B,1,H,W) on the device of a signal (B,C,H,W): of a map, or one number per sample.
+
+    Raises:    TypeError, ValueError for what can be none.
+    """
+    values = as_values(depth, name="inverse_depth", unit="1/m")
+    batch, _, height, width = signal.shape
+    values = as_map(values, shape=(batch, height, width), name="inverse_depth", unit=" in 1/m")
+    if values.numel():
+        low, high = (float(bound) for bound in values.detach().aminmax())
+        if not (low >= 0 and math.isfinite(high)):
+            raise ValueError(
+                f"inverse_depth has values from {low:g} to {high:g}, expected finite ones >= 0 [1/m]: 1 over the "
+                "distance in metres, 0 at infinity. Use 1 / depth."
+            )
+    values = values if values.ndim == 4 else values.reshape(-1, 1, 1, 1).expand(batch, 1, height, width)
+    return values.to(signal.device)
+
+
+class Checked:
+    """What every augmentation here says of an input that it cannot take, before Kornia does."""
+
+    wavelengths: Tensor | None = None
+    takes_alpha = False
+    """Whether all channels are treated alike, whatever they hold."""
+
+    def forward(self, input: Tensor, params: dict[str, Any] | None = None, **kwargs: Any) -> Tensor:
+        """As Kornia's. Raises: TypeError, ValueError with the code that makes the input right."""
+        check_floats(input, name="image", takes=TAKES, channels=None)
+        if not {"linear", "cube"} & kwargs.keys():  # from `CameraSequential`, which knows what it gives
+            check_layout(input, wavelengths=self.wavelengths, alpha=self.takes_alpha)
+        return super().forward(input, params, **kwargs)  # type: ignore[misc]
 
 
 def drawn_rows(params: dict[str, Any], *, p: float) -> Tensor | None:
@@ -101,7 +165,7 @@ def drawn_rows(params: dict[str, Any], *, p: float) -> Tensor | None:
     return None if bool(gate.all()) else gate.nonzero().flatten()
 
 
-class CameraAugmentation(K.IntensityAugmentationBase2D):
+class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
     """Base of the augmentations that keep the pixel grid. A subclass computes in `simulate`.
 
     Kornia transforms all rows and then throws away those that were not drawn; here they cost nothing. Half precision
@@ -163,7 +227,7 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         self, input: Tensor, params: dict[str, Any], function: Callable[[Tensor, dict[str, Tensor]], Tensor]
     ) -> Tensor:
         """`function` of the rows that were drawn; the others as they are."""
-        drawn = self._drawn(params)
+        drawn = self._drawn(params, input)
         if input.shape[0] == 0 or input.numel() == 0:
             shape = (input.shape[0], self.output_channels(input.shape[1]), *input.shape[2:])
             return input.new_zeros(shape) + input.sum()
@@ -178,7 +242,7 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
             raise self._mixed(input.shape[1], result.shape[1])
         return input.index_copy(0, here, result)
 
-    def _drawn(self, params: dict[str, Any]) -> dict[str, Tensor]:
+    def _drawn(self, params: dict[str, Any], input: Tensor) -> dict[str, Tensor]:
         """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""
         drawn = {name: params[name] for name in self._param_generator.draws}
         if "noise_seed" in drawn and "video_batch_size" in params:
@@ -190,12 +254,12 @@ class CameraAugmentation(K.IntensityAugmentationBase2D):
         if "inverse_depth" in params:
             if not self.takes_depth:
                 raise TypeError(f"{type(self).__name__} takes no inverse_depth: what it does is the same everywhere.")
-            drawn["inverse_depth"] = params["inverse_depth"]
+            drawn["inverse_depth"] = check_inverse_depth(params["inverse_depth"], input)
         return drawn
 
     def _simulated(self, input: Tensor, drawn: dict[str, Tensor], *, linear: bool) -> Tensor:
         working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-        check_values(working, picture=is_picture(working) and not linear)
+        check_values(working, picture=is_picture(working) and not linear, linear=linear)
         with full_precision(input.device):
             coded = self.in_light and is_picture(working) and not linear
             result = self.simulate(to_light(working) if coded else working, drawn)

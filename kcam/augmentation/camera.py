@@ -30,7 +30,8 @@ class RandomCamera(CameraAugmentation):
 
     A picture counts as a scene whose paints have its colours (`Scene.from_rgb`), a cube as spectral radiance in
     daylight (`Scene.from_bands`); both become pictures. A map of inverse depth, from `CameraSequential` or as
-    ``augment(image, inverse_depth=map)`` (B,1,H,W) [1/m], takes the place of the drawn distance.
+    ``augment(image, inverse_depth=map)``, (B,1,H,W) or one number per sample (B,) [1/m], takes the place of the drawn
+    distance.
 
     Each camera is planned once for each size of picture, on a fixed scene at both ends of the range of distances, never
     for a batch: the result for a sample does not depend on the others. With a map it is planned from infinity to the

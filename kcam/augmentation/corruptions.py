@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import kornia.augmentation as K
 import torch
 
+from kcam.augmentation.base import TAKES, check_layout
 from kcam.augmentation.geometry import RandomLensDistortion
 from kcam.augmentation.isp import RandomWhiteBalance
 from kcam.augmentation.optics import (
@@ -26,6 +26,7 @@ from kcam.augmentation.sensor import (
     RandomQuantisation,
     RandomShotReadNoise,
 )
+from kcam.inputs import check_array, check_floats
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,11 @@ def corrupt(image: Any, corruption: str, *, severity: int = 1, seed: int = 0) ->
     Returns:   a tensor of the shape, type and device of the picture, in [0,1].
     Raises:    ValueError for an unknown name or severity; TypeError for a path, or a seed that is no integer.
     """
-    if isinstance(image, (str, bytes, os.PathLike)):
-        raise TypeError(f"image must be a tensor, an array or a PIL image, got {image!r}. Read the file first.")
+    if isinstance(image, torch.Tensor):
+        check_floats(image, name="image", takes=TAKES, channels=None)
+        check_layout(image, alpha=True)
+    else:
+        check_array(image, name="image")
     if isinstance(seed, bool) or not isinstance(seed, int):
         raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
     if corruption not in CORRUPTIONS:

@@ -14,7 +14,7 @@ from kornia.geometry.keypoints import Keypoints
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from kcam.augmentation.base import check_probability, drawn_rows
+from kcam.augmentation.base import Checked, check_probability, drawn_rows
 from kcam.augmentation.draws import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
@@ -23,7 +23,7 @@ _TOLERANCE = 0.01  # of the inverse, at probes all over the picture [pixels]
 _EDGE_SAMPLES = 9  # of a box's edge: a straight edge becomes a curve
 
 
-class RandomLensDistortion(K.GeometricAugmentationBase2D):
+class RandomLensDistortion(Checked, K.GeometricAugmentationBase2D):
     """Barrel and pincushion distortion: the Brown-Conrady model, with OpenCV's coefficients.
 
     x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),   y_d = y (1 + ...) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -39,6 +39,8 @@ class RandomLensDistortion(K.GeometricAugmentationBase2D):
         inverse does not converge to 0.01 pixels).
     Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
     """
+
+    takes_alpha = True
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from kcam.augmentation.base import CameraAugmentation, per_sample, wavelengths_of
+from kcam.augmentation.base import CameraAugmentation, check_inverse_depth, per_sample, wavelengths_of
 from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
 from kcam.optics import batch_psf, refractive_index
 from kcam.optics.convolution import Convolution, Renderer
@@ -112,7 +112,7 @@ class RandomDefocus(RandomBlur):
 
     With a map of inverse depth the picture is cut into `layers` layers, equally far apart in vergence, blurred and laid
     over each other from far to near, as `optics.Imaging` does. Such a map comes from `CameraSequential`, or as
-    ``augment(image, inverse_depth=map)``, (B,1,H,W) [1/m], 0 at infinity.
+    ``augment(image, inverse_depth=map)``, (B,1,H,W) or one number per sample (B,) [1/m], 0 at infinity.
 
     Args:      focus: distance in focus [m]. f_number: N. distance: of the picture without a map [m]. Distances are
                    drawn uniformly in 1/m, inf allowed.
@@ -233,21 +233,6 @@ class RandomDefocus(RandomBlur):
         shape = self.window((signal.shape[-2], signal.shape[-1]), half_width)
         drawn = drawn | {"vergences": vergences[None]}
         return vergences, self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)[0]
-
-
-def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:
-    """A map of inverse depth as (B,1,H,W) on the device of a signal (B,C,H,W); ValueError for what can be none."""
-    expected = (signal.shape[0], 1, *signal.shape[-2:])
-    depth = depth[:, None] if depth.ndim == 3 else depth
-    if depth.ndim != 4 or depth.shape != expected:
-        raise ValueError(f"inverse_depth has shape {tuple(depth.shape)}, expected {expected}, in 1/m.")
-    low = float(depth.detach().min())
-    if not (low >= 0 and bool(depth.isfinite().all())):
-        raise ValueError(
-            f"inverse_depth has values from {low:g} to {float(depth.max()):g}, expected finite ones >= 0 [1/m]: 1 over "
-            "the distance in metres, 0 at infinity."
-        )
-    return depth.to(signal.device)
 
 
 LEAST_VERGENCE = 1e-9

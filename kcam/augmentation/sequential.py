@@ -17,10 +17,11 @@ from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from torch import Tensor, nn
 
-from kcam.augmentation.base import CameraAugmentation, wavelengths_of
+from kcam.augmentation.base import TAKES, CameraAugmentation, check_layout, wavelengths_of
 from kcam.augmentation.optics import finite_vergence
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context, Stage
+from kcam.inputs import check_array, check_floats
 from kcam.isp import ToneCurve
 from kcam.optics import Imaging
 from kcam.scene import Scene
@@ -138,8 +139,14 @@ class CameraSequential(K.AugmentationSequential):
         return input
 
     def told(self, name: str) -> dict[str, Tensor]:
-        """What a child is told of where it stands: that what reaches it is linear light, not a coded picture."""
-        return {"linear": torch.ones(())} if name in self._linear else {}
+        """What a child is told of where it stands: that what reaches it is linear light, not a coded picture.
+
+        Or that the wavelengths of what came in are known: four channels are then bands, not red, green, blue and alpha.
+        """
+        if name in self._linear:
+            return {"linear": torch.ones(())}
+        ours = self.wavelengths is not None and isinstance(self.get_submodule(name), CameraAugmentation)
+        return {"cube": torch.ones(())} if ours else {}
 
     @staticmethod
     def runs(module: nn.Module) -> bool:
@@ -187,11 +194,24 @@ class CameraSequential(K.AugmentationSequential):
             isinstance(module, Imaging) or getattr(module, "takes_depth", False) for module in self.children()
         )
         for place, (value, key) in enumerate(zip(args, data_keys, strict=False)):
-            if key == DataKey.INPUT and isinstance(value, Tensor):
+            if key == DataKey.INPUT:
+                if not isinstance(value, Tensor):
+                    check_array(value, name="image", bands=self._known_bands())
+                check_floats(value, name="image", takes=TAKES, channels=None)
+                check_layout(value, wavelengths=self.wavelengths, alpha=True)
                 self._enters(value)
             if key == DataKey.MASK and seeing and self.transform_op.is_depth(place, data_keys):
                 _check_is_depth(value)
         return super()._arguments_preproc(*args, data_keys=data_keys, params=params)
+
+    def to_tensor(self, x: Any) -> Tensor:
+        """Kornia's, of what it reads as it is meant."""
+        if not isinstance(x, (Tensor, str)):
+            check_array(x, name="image", bands=self._known_bands())
+        return super().to_tensor(x)
+
+    def _known_bands(self) -> int | None:
+        return None if self.wavelengths is None else len(self.wavelengths)
 
     def _preproc_dict_data(self, data: dict[str, Any]) -> Any:
         prepared = super()._preproc_dict_data(data)

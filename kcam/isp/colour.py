@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from kcam import spectral
 from kcam.context import Context, Stage
+from kcam.inputs import ALPHA, channels_last, check_signal, remedy
 from kcam.sensor.colour_filter import ColourFilter
 from kcam.sensor.noise import hold, in_float32, like
 from kcam.ste import clip_ste
@@ -42,9 +43,20 @@ def _filter_of(context: Context, channels: int) -> ColourFilter:
 
 
 def _channels(signal: Tensor) -> int:
+    check_signal(signal)
     if signal.ndim < 3:
-        raise ValueError(f"expected a picture (..., C, H, W), got shape {tuple(signal.shape)}.")
+        fix = remedy(signal, name="signal", scaled=False)
+        raise ValueError(f"expected a picture (..., C, H, W), got shape {tuple(signal.shape)}.{fix}")
     return signal.shape[-3]
+
+
+def _channels_first(signal: Tensor) -> int:
+    """ValueError with the code where channels come last: no colour filter has as many curves as rows."""
+    channels = _channels(signal)
+    if channels_last(signal.shape) and channels != ALPHA:
+        fix = remedy(signal, name="signal", channels=None, scaled=False)
+        raise ValueError(f"expected a picture (..., C, H, W), got shape {tuple(signal.shape)}.{fix}")
+    return channels
 
 
 def as_shot_gains(context: Context, *, channels: int = 3) -> Tensor:
@@ -103,7 +115,7 @@ class WhiteBalance(Stage):
         """(B,C,H,W) to the same shape."""
         gains = self.gains
         if gains is None:
-            gains = as_shot_gains(context or Context(), channels=_channels(signal))
+            gains = as_shot_gains(context or Context(), channels=_channels_first(signal))
         return white_balance(signal, gains=gains)
 
 
@@ -193,7 +205,7 @@ class ColourMatrix(Stage):
         """(B,C,H,W) to (B,3,H,W)."""
         matrix = self.matrix
         if matrix is None:
-            matrix = as_shot_colour_matrix(context or Context(), channels=_channels(signal))
+            matrix = as_shot_colour_matrix(context or Context(), channels=_channels_first(signal))
         return apply_colour_matrix(signal, matrix=matrix)
 
     def output_channels(self, channels: int, context: Context | None = None) -> int:
@@ -217,10 +229,12 @@ def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor 
     Returns:   same shape, in [0,1]. The gradient is finite everywhere; beyond the clip it is that of `clip_ste`.
     Raises:    ValueError for another number of channels.
     """
+    check_signal(signal, channels=(1, 3))
     channels = _channels(signal)
     if channels not in (1, 3):
         raise ValueError(
             f"the sRGB curve takes 3 channels, or 1 of gray, got {channels}. Put a ColourMatrix before it."
+            f"{remedy(signal, name='signal', scaled=False)}"
         )
     clipped = clip_ste(signal, 0.0, 1.0)
     if channels == 3:
@@ -292,4 +306,5 @@ class Clip(Stage):
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """Any shape."""
+        check_signal(signal)
         return clip_ste(signal, 0.0, 1.0)

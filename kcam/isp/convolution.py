@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.inputs import remedy
 from kcam.sensor.noise import hold, in_float32
 
 
@@ -23,6 +24,7 @@ def convolve_planes(signal: Tensor, *, weight: Tensor, bias: Tensor) -> Tensor:
         raise ValueError(
             f"a kernel of shape {tuple(weight.shape)} takes {channels} planes (..., {channels}, H, W), got shape "
             f"{tuple(signal.shape)}. Put it behind a Demosaic."
+            f"{remedy(signal, name='signal', channels=(channels,), scaled=False)}"
         )
     if signal.numel() == 0:
         return signal.new_zeros(*signal.shape[:-3], len(weight), *signal.shape[-2:])

@@ -7,6 +7,7 @@ height and width. They run in the domain, and after the balancing, that measured
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.inputs import check_signal, remedy
 from kcam.isp.colour import as_shot_gains, gains_of
 from kcam.sensor.mosaic import PATTERNS, pattern_tile
 from kcam.sensor.noise import hold, in_float32, like
@@ -361,9 +363,10 @@ def _check_domain(domain: str) -> None:
 
 def _check_mosaic(mosaic: Tensor) -> None:
     if mosaic.ndim < 3 or mosaic.shape[-3] != 1:
+        fix = remedy(mosaic, name="mosaic", channels=(1,), scaled=False)
         raise ValueError(
             f"a demosaic takes the one mosaiced plane (..., 1, H, W), got shape {tuple(mosaic.shape)}. "
-            "Put a sensor.Mosaic before it, or leave the demosaic out."
+            f"Put a sensor.Mosaic before it, or leave the demosaic out.{fix}"
         )
 
 
@@ -408,7 +411,7 @@ def demosaic(
     row = _row(method, pattern)
     _check_domain(domain)
     _check_mosaic(mosaic)
-    planes = mosaic.reshape(-1, *mosaic.shape[-3:])
+    planes = mosaic.reshape(math.prod(mosaic.shape[:-3]), *mosaic.shape[-3:])
     channels = _channels(pattern)
     if gains is not None and gains.shape != (channels,):
         raise ValueError(
@@ -464,6 +467,7 @@ class Demosaic(Stage):
         gains = self.gains
         if gains is None and context.colour_filter is not None:
             gains = as_shot_gains(context, channels=_channels(pattern))
+        check_signal(signal)
         signal = signal - like(context.black_level, signal)
         return demosaic(signal, pattern=pattern, method=self.method, domain=self.domain, gains=gains)
 
@@ -529,6 +533,7 @@ class LearnedDemosaic(Stage):
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,1,H,W) to (B,N,H,W)."""
+        check_signal(signal)
         signal = signal - like((context or Context()).black_level, signal)
         return learned_demosaic(signal, weight=self.weight, bias=self.bias)
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.inputs import check_signal, remedy
 from kcam.optics.transforms import fast_length
 from kcam.precision import full_precision
 from kcam.ste import clip_ste
@@ -170,12 +171,12 @@ class StyleStage(Stage):
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,3,H,W) sRGB in [0,1] to the same shape, in 0.018..0.982."""
+        check_signal(signal, channels=(3,))
         if signal.ndim != 4 or signal.shape[1] != 3:
             raise ValueError(
                 f"StyleStage repaints pictures (B,3,H,W), got shape {tuple(signal.shape)}. Put it behind the ToneCurve."
+                f"{remedy(signal, name='signal', channels=(3,), ndims=(4,), scaled=False)}"
             )
-        if not signal.is_floating_point():
-            raise TypeError(f"StyleStage repaints pictures in [0,1], got {signal.dtype}. Use picture / 255.")
         if signal.numel() == 0:
             return signal
         height, width = signal.shape[-2:]
@@ -272,9 +273,7 @@ def _flowing(draw: Callable[[int, int, int], Tensor], planes: int, height: int, 
         place = turns.repeat_interleave(2, dim=1)[:, :planes] + across
         below = place.floor()
         share = place - below
-        first, second = (
-            drawn.gather(2, (below.long() + step)[:, :, None] % DIRECTIONS).squeeze(2) for step in (0, 1)
-        )
+        first, second = (drawn.gather(2, (below.long() + step)[:, :, None] % DIRECTIONS).squeeze(2) for step in (0, 1))
         variance = (1 - share) ** 2 + share**2 + 2 * overlap * share * (1 - share)
         strips.append((first * (1 - share) + second * share) * variance.rsqrt())
     return torch.cat(strips, dim=2)

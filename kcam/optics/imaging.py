@@ -20,6 +20,7 @@ from torch import Tensor
 from kcam.cache import ValueCache, differentiated
 from kcam.context import Context, Stage
 from kcam.effects import Work
+from kcam.inputs import check_bands, describe
 from kcam.optics.convolution import BORDERS, Renderer, rendering_work
 from kcam.optics.lens import Lens
 from kcam.optics.propagation import PHYSICS, Propagator, choose
@@ -127,7 +128,12 @@ class Imaging(Stage):
         if precision not in (None, "float32", "float64"):
             raise ValueError(f'precision must be "float32", "float64" or None for the scene\'s, got {precision!r}.')
         if distance is not None:
-            check_distances(distance)
+            if check_distances(distance).numel() != 1:
+                raise TypeError(
+                    f"distance must be one number of metres, got {describe(distance)}. Use "
+                    "Scene.from_bands(bands, depth=distance) for one per sample or a map."
+                )
+            distance = float(distance)
         if not max_memory > 0:
             raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory:g}.")
         self.lens = lens
@@ -205,11 +211,14 @@ class Imaging(Stage):
 
         Equal steps of at most `waves` of defocus, or the map's own distances where it has no more of them. A step dV in
         vergence is a^2 dV / (2 lambda) waves at the rim. A map that requires grad is cut into equal steps always: their
-        ends carry the gradient of its nearest and farthest point. Their number follows the map in steps.
+        ends carry the gradient of its nearest and farthest point. Their number follows the map in steps. Numbers of one
+        per sample (B,) are layers of their own, those that differ: no pixel lies between two of them.
         """
         vergence = 1 / depth.to(torch.float64)
         if not self.blur:
             return vergence.flatten()[:1]
+        if vergence.ndim == 1 and len(vergence) > 1:
+            return vergence.unique()
         low, high = vergence.min(), vergence.max()
         span = float((high - low).detach())
         if span == 0:
@@ -251,14 +260,7 @@ class Imaging(Stage):
     # ---- scene and optics ------------------------------------------------------------------------------------------
 
     def _as_scene(self, bands: Tensor, context: Context) -> Scene:
-        if not isinstance(bands, Tensor) or bands.ndim != 4:
-            got = tuple(bands.shape) if isinstance(bands, Tensor) else type(bands).__name__
-            raise ValueError(f"Imaging takes a Scene or bands (B, L, H, W), got {got}.")
-        if bands.shape[1] != context.wavelengths.numel():
-            raise ValueError(
-                f"{bands.shape[1]} bands do not match {context.wavelengths.numel()} wavelengths; give a Scene with its "
-                "own, or as many bands as wavelengths."
-            )
+        check_bands(bands, name="bands", count=context.wavelengths.numel(), ndims=(4,), sure=False)
         distance = self.distance if self.distance is not None else self.lens.focus_distance
         if not distance > 0:
             raise ValueError(
@@ -348,6 +350,8 @@ class Imaging(Stage):
         """Vergences of the layers in which there is anything, and the share of each pixel in them; None for one."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
         vergences = self._vergences(scene, depth)
+        if depth.ndim == 1 and len(depth) > 1:
+            return vergences, None
         self._check_layers(1 / depth, vergences, scene.wavelengths)
         if vergences.numel() == 1:
             return vergences, None
@@ -361,6 +365,9 @@ class Imaging(Stage):
 
     def work(self, scene: Scene, *, channels: int | None = None) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
+        if len(apart := alike(scene)) > 1:
+            works = [self.work(_rows(scene, rows), channels=channels) for rows in apart]
+            return sum(works[1:], works[0])
         planes = self._working(scene)
         batch, count, height, width = planes.shape
         bands, factored = scene.wavelengths.numel(), scene.spectra is not None
@@ -414,6 +421,9 @@ class Imaging(Stage):
         channels = bands if contraction is None else contraction.shape[0]
         if planes.numel() == 0:
             return planes.new_zeros(batch, channels, height, width) + planes.sum()
+        if len(groups := alike(scene)) > 1:
+            parts = [self._render(_rows(scene, rows), planes[rows.to(planes.device)], contraction) for rows in groups]
+            return torch.cat(parts)[torch.cat(groups).argsort().to(planes.device)]
         spectra = None if scene.spectra is None else scene.spectra.to(planes)
         weights = None if contraction is None else contraction.to(planes)
         vergences, shares = self._layers_of(scene, planes)
@@ -500,6 +510,28 @@ def _few_values(values: Tensor, *, at_most: int) -> Tensor | None:
         return None
     found = flat.unique()
     return found if found.numel() <= at_most else None
+
+
+def alike(scene: Scene) -> list[Tensor]:
+    """Rows of a batch at one distance each, in the order in which distances come first; one list for all but (B,).
+
+    Where a derivative passes through the distances each sample is alone: one PSF for two would share it out.
+    """
+    depth, batch = scene.depth, scene.shape[0]
+    if not isinstance(depth, Tensor) or depth.ndim != 1 or batch < 2:
+        return [torch.arange(batch)]
+    if differentiated(depth):
+        return list(torch.arange(batch)[:, None])
+    groups: dict[float, list[int]] = {}
+    for row, distance in enumerate(depth.tolist()):
+        groups.setdefault(distance, []).append(row)
+    return [torch.tensor(rows) for rows in groups.values()]
+
+
+def _rows(scene: Scene, rows: Tensor) -> Scene:
+    """Some samples of a batch, all at the distance of the first."""
+    depth = scene.depth[rows[:1]] if isinstance(scene.depth, Tensor) else scene.depth
+    return replace(scene, coefficients=scene.coefficients[rows.to(scene.device)], depth=depth)
 
 
 def _map_work(query: Query) -> float:

@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from kcam import spectral
 from kcam.context import Context, Stage
+from kcam.inputs import band_remedy, check_signal
 from kcam.precision import full_precision
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import hold
@@ -296,9 +297,13 @@ class ColourFilter(Stage):
         Raises:    ValueError if the number of bands is not that of the wavelengths.
         """
         wavelengths = (context or Context()).wavelengths
+        check_signal(signal, bands=len(wavelengths))
+        fix = ""
+        if signal.ndim < 3 or signal.shape[-3] != len(wavelengths):
+            fix = band_remedy(signal, name="signal", bands=len(wavelengths), ndims=(3, 4))
         if signal.ndim < 3:
-            raise ValueError(f"expected bands (..., L, H, W), got shape {tuple(signal.shape)}.")
-        _check_bands(signal.shape[-3], wavelengths, "the signal has")
+            raise ValueError(f"expected bands (..., L, H, W), got shape {tuple(signal.shape)}.{fix}")
+        _check_bands(signal.shape[-3], wavelengths, "the signal has", fix)
         weights = self.contraction(wavelengths).to(signal)
         with full_precision(signal.device):
             return self.finish(torch.einsum("kl,...lhw->...khw", weights, signal))
@@ -321,11 +326,11 @@ def _shares(wavelengths: Tensor) -> Tensor:
     return spectral.band_widths(wavelengths) / REFERENCE_BANDWIDTH
 
 
-def _check_bands(bands: int, wavelengths: Tensor, subject: str) -> None:
+def _check_bands(bands: int, wavelengths: Tensor, subject: str, fix: str = "") -> None:
     if bands != len(wavelengths):
         raise ValueError(
             f"{subject} {bands} bands, but there are {len(wavelengths)} wavelengths; pass one wavelength per band, "
-            f"such as Context(wavelengths=torch.linspace(420, 720, {bands}) * nm)."
+            f"such as Context(wavelengths=torch.linspace(420, 720, {bands}) * nm).{fix}"
         )
 
 

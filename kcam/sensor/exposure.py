@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcam.context import Context, Stage
+from kcam.inputs import check_signal
 from kcam.sensor.colour_filter import REFERENCE_BANDWIDTH, ColourFilter
 from kcam.sensor.noise import hold
 from kcam.units import as_numbers, check_positive, nm
@@ -155,6 +156,7 @@ class Exposure(Stage):
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) relative irradiance to a share of the full well, not clipped."""
+        check_signal(signal)
         return signal * self.factor(context).to(signal)
 
     def provides(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcam.context import Context, Stage
+from kcam.inputs import check_signal, remedy
 
 CHANNELS = "RGBW"
 
@@ -56,8 +57,9 @@ def mosaic(signal: Tensor, *, pattern: str) -> Tensor:
 
     Args:      signal: (..., C, H, W), C = 3, or 4 for "rgbw".  pattern: a name in `PATTERNS`.
     Returns:   (..., 1, H, W), values unchanged; the gradient is 1 at the kept channel, 0 elsewhere.
-    Raises:    ValueError for an unknown pattern or another number of channels.
+    Raises:    ValueError for an unknown pattern or another number of channels; TypeError for integers.
     """
+    check_signal(signal)
     tile = pattern_tile(pattern)
     channels = int(tile.max()) + 1
     if signal.ndim < 3 or signal.shape[-3] != channels:
@@ -65,6 +67,7 @@ def mosaic(signal: Tensor, *, pattern: str) -> Tensor:
             f"pattern {pattern!r} selects among {channels} channels ({', '.join(CHANNELS[:channels])}): expected "
             f"(..., {channels}, H, W), got shape {tuple(signal.shape)}. Put a ColourFilter with {channels} curves "
             "before it; a learned tile gives the mosaiced plane itself and takes no Mosaic."
+            f"{remedy(signal, name='signal', channels=(channels,), scaled=False)}"
         )
     masks = channel_masks(pattern, *signal.shape[-2:], device=signal.device)
     raw = signal[..., 0, :, :]

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam.context import Context, Stage
+from kcam.inputs import check_signal
 from kcam.precision import full_precision
 from kcam.ste import clip_ste
 from kcam.units import as_numbers, check_positive
@@ -59,11 +60,7 @@ def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
     @functools.wraps(function)
     def wrapper(signal: Tensor, **arguments: Any) -> Tensor:
-        if not signal.is_floating_point():
-            raise TypeError(
-                f"expected a floating-point signal in which 1.0 is the full well, got {signal.dtype}; "
-                "divide by the largest value, such as image / 255."
-            )
+        check_signal(signal)
         working = signal.float() if signal.dtype in (torch.float16, torch.bfloat16) else signal
         with full_precision(signal.device):
             return function(working, **arguments).to(signal.dtype)
@@ -74,7 +71,15 @@ def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 class _Poisson(torch.autograd.Function):
     @staticmethod
     def forward(rate: Tensor, generator: torch.Generator | None) -> Tensor:
-        return torch.poisson(rate, generator=generator)
+        try:
+            return torch.poisson(rate, generator=generator)
+        except RuntimeError as error:
+            if not rate.isnan().any():
+                raise
+            raise ValueError(
+                f"the signal has {int(rate.isnan().sum())} values that are NaN: photons cannot be counted. Remove NaN "
+                "where it comes from, or use signal.nan_to_num(0)."
+            ) from error
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from kcam.inputs import check_floats, remedy
+
 SCALES = 4
 ORIENTATIONS = 6
 BANDWIDTH = 0.62  # of the radial log-Gaussian, in ln(frequency)
@@ -30,12 +32,10 @@ NATURAL = {"colour": 0.25, "low": 0.2, "scale 0": 0.02, "scale 1": 0.008, "scale
 
 def check_pictures(picture: Tensor, *, multiple: int, least: int) -> None:
     """TypeError, ValueError unless it is (B,3,H,W) of a size that the features can be taken of."""
-    if not isinstance(picture, Tensor) or not picture.is_floating_point():
-        got = picture.dtype if isinstance(picture, Tensor) else type(picture).__name__
-        raise TypeError(f"features are taken of a floating-point picture (B,3,H,W), got {got}.")
+    check_floats(picture, name="picture", takes="(B,3,H,W)", channels=(3,), ndims=(4,))
     if picture.ndim != 4 or picture.shape[1] != 3:
-        hint = " Add the batch: picture[None]." if picture.ndim == 3 else ""
-        raise ValueError(f"features are taken of pictures (B,3,H,W), got shape {tuple(picture.shape)}.{hint}")
+        fix = remedy(picture, name="picture", channels=(3,), ndims=(4,))
+        raise ValueError(f"features are taken of pictures (B,3,H,W), got shape {tuple(picture.shape)}.{fix}")
     height, width = picture.shape[-2:]
     if min(height, width) < least or height % multiple or width % multiple:
         better = tuple(max(least, size // multiple * multiple) for size in (height, width))

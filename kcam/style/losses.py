@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from kcam.inputs import check_floats, check_picture, remedy
 from kcam.style.features import SteerableFeatures
 
 FLOOR = 0.1  # of a natural picture's variance: what a flat style is divided by
@@ -320,9 +321,9 @@ class StyleLoss(nn.Module):
                 deviation=self.deviation[some],
             )
         if weights["content"]:
-            terms["content"] = weights["content"] * self._content(picture, _given(scene, "content"), layers)
+            terms["content"] = weights["content"] * self._content(picture, _given(scene, "content", picture), layers)
         if weights["l2"]:
-            pair = (picture, _given(scene, "l2")) if recorded is None else recorded
+            pair = (picture, _given(scene, "l2", picture)) if recorded is None else recorded
             terms["l2"] = weights["l2"] * l2_loss(*pair)
         if weights["tv"]:
             terms["tv"] = weights["tv"] * total_variation(picture)
@@ -353,24 +354,12 @@ class StyleLoss(nn.Module):
         return content_loss(layers[self.content_layer], target)
 
 
-def check_picture(picture: Tensor, *, name: str) -> None:
-    """TypeError, ValueError unless it is a picture (3,H,W) with values in [0,1]."""
-    if not isinstance(picture, Tensor) or not picture.is_floating_point():
-        got = picture.dtype if isinstance(picture, Tensor) else type(picture).__name__
-        raise TypeError(f"{name} is a floating-point picture (3,H,W) in [0,1], got {got}.")
-    if picture.ndim != 3 or picture.shape[0] != 3 or picture.numel() == 0:
-        raise ValueError(f"{name} is one picture (3,H,W), got shape {tuple(picture.shape)}.")
-    low, high = (value.item() for value in picture.detach().aminmax())
-    if not (low >= 0 and high <= 1):
-        raise ValueError(f"{name} has values in [0,1], got {low:g} to {high:g}. Use picture.clamp(0, 1), or / 255.")
-
-
 def style_crops(picture: Tensor, *, side: int | None, multiple: int, least: int, most: int = 64) -> Tensor:
     """Crops that cover a style picture evenly, (N,3,s,s): at its own pixels, at most `most` of them.
 
     Raises:    TypeError, ValueError for what is no picture in [0,1], or one that is smaller than the features ask.
     """
-    check_picture(picture, name="a style")
+    check_picture(picture, name="picture", channels=(3,), ndims=(3,))
     if side is not None and side < least:
         raise ValueError(f"crops of {side} pixels are too small: the features need at least {least}. Use crop={least}.")
     shorter = min(picture.shape[-2:])
@@ -390,7 +379,11 @@ def style_crops(picture: Tensor, *, side: int | None, multiple: int, least: int,
     return torch.stack([picture[:, top : top + side, left : left + side] for top in tops for left in lefts])
 
 
-def _given(scene: Tensor | None, term: str) -> Tensor:
+def _given(scene: Tensor | None, term: str, picture: Tensor) -> Tensor:
     if scene is None:
         raise ValueError(f"the {term} term compares with a scene, and none was given. Pass scene=, or {term}=0.")
+    check_floats(scene, name="scene", takes="(B,3,H,W) in [0,1]", channels=(3,), ndims=(4,))
+    if scene.shape != picture.shape:
+        fix = remedy(scene, name="scene", channels=(3,), ndims=(4,), scaled=False)
+        raise ValueError(f"scene has shape {tuple(scene.shape)}, expected the picture's, {tuple(picture.shape)}.{fix}")
     return scene

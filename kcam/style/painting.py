@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from kcam.inputs import check_picture
 from kcam.ste import clip_ste
 from kcam.style.draws import torch_generator
-from kcam.style.losses import StyleLoss, check_picture
+from kcam.style.losses import StyleLoss
 from kcam.threads import no_more_than_free
 
 STARTS = ("photo", "noise")
@@ -58,7 +59,7 @@ def paint(
     if photo is None and (loss.weights["content"] or loss.weights["l2"]):
         raise ValueError("there is no photo for the content to be compared with. Pass StyleLoss(..., content=0).")
     if photo is not None:
-        check_picture(photo, name="a photo")
+        check_picture(photo, name="photo", channels=(3,), ndims=(3,))
     height, width = photo.shape[-2:] if photo is not None else shape or (0, 0)
     multiple, least = (int(size) for size in (loss.features.multiple, loss.features.least))
     rows, columns = (max(least, math.ceil(size / multiple) * multiple) for size in (height, width))

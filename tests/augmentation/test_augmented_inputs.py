@@ -67,7 +67,7 @@ def test_plain_stages_are_told_the_wavelengths() -> None:
         (lambda: KC.RandomQuantisation(8.5), ValueError, "bits must be whole numbers"),
         (lambda: KC.RandomQuantisation([8, 10, 12]), ValueError, "bits must be whole numbers"),
         (lambda: KC.RandomCamera([3]), TypeError, "cameras must be names, files or cameras"),
-        (lambda: KC.corrupt("a.png", "defocus"), TypeError, "Read the file first"),
+        (lambda: KC.corrupt("a.png", "defocus"), TypeError, "name of a file: use kcam.scene.read_picture"),
         (lambda: KC.corrupt(PICTURE, "defocus", seed="a"), TypeError, "seed must be an integer"),
         (lambda: KC.RandomDefocus(p=2.0), ValueError, "p must be a probability from 0 to 1"),
         (lambda: KC.RandomLensDistortion(p="a"), TypeError, "p must be a probability"),

@@ -115,7 +115,7 @@ class TestShotReadNoise:
         """var = (g / w) x + (g sigma / w)^2 and an unbiased mean, each within 5 standard errors of 160 000 pixels."""
         well, sigma, count = 10_000.0, 3.0, 160_000
         augmentation = KC.RandomShotReadNoise(iso, full_well=well, read_noise=sigma, p=1.0)
-        light = torch.full((4, 4, 100, 100), level, dtype=torch.float64)
+        light = torch.full((4, 5, 100, 100), level, dtype=torch.float64)
         _, drawn = augmented(augmentation, light)
         found = augmentation.simulate(light, drawn)
         gain = iso / 100
@@ -144,7 +144,7 @@ class TestShotReadNoise:
 
     def test_it_saturates_at_white_and_keeps_below_it_what_read_noise_takes(self) -> None:
         augmentation = KC.RandomShotReadNoise((100.0, 25_600.0), p=1.0)
-        light = torch.full((8, 4, 30, 30), 1.0, dtype=torch.float64)
+        light = torch.full((8, 5, 30, 30), 1.0, dtype=torch.float64)
         _, drawn = augmented(augmentation, light)
         found = augmentation.simulate(light * 3, drawn)
         assert found.max() == 1  # and no more
@@ -161,7 +161,7 @@ class TestShotReadNoise:
     def test_gradients_to_range_and_light_are_unbiased_in_the_mean(self) -> None:
         """d mean / d light is 1 at every level: the mean of `poisson`'s slope, within 5 standard errors."""
         augmentation = KC.RandomShotReadNoise(400.0, p=1.0)
-        light = torch.full((1, 4, 100, 100), 0.2, dtype=torch.float64, requires_grad=True)
+        light = torch.full((1, 5, 100, 100), 0.2, dtype=torch.float64, requires_grad=True)
         _, drawn = augmented(augmentation, light)
         augmentation.simulate(light, drawn).sum().backward()
         spread = 0.5 / math.sqrt(0.2 * 10_000 / 4)  # (N - lambda) / 2 lambda
@@ -186,7 +186,7 @@ class TestFixedPattern:
 
     def test_its_spread_is_the_drawn_one(self) -> None:
         augmentation = KC.RandomFixedPattern(prnu=0.02, dsnu=10.0, full_well=1000.0, p=1.0)
-        bright = torch.full((1, 4, 100, 100), 0.5, dtype=torch.float64)
+        bright = torch.full((1, 5, 100, 100), 0.5, dtype=torch.float64)
         _, drawn = augmented(augmentation, bright)
         dark = augmentation.simulate(bright * 0, drawn)
         assert float(dark.std()) == pytest.approx(0.01, rel=5 / math.sqrt(2 * dark.numel()))

@@ -740,7 +740,7 @@ def test_errors_at_the_call() -> None:
         KC.RandomLensDistortion(k1=-3.0, p=1.0)(picture())
     defocus = KC.RandomDefocus(p=1.0)
     x = picture(2, 3, 8, 8)
-    with pytest.raises(ValueError, match=r"inverse_depth has shape \(2, 1, 4, 4\), expected \(2, 1, 8, 8\), in 1/m"):
+    with pytest.raises(ValueError, match=r"inverse_depth has shape \(2, 1, 4, 4\), .* \(2, 1, 8, 8\), .* in 1/m"):
         defocus(x, inverse_depth=torch.ones(2, 1, 4, 4))
     with pytest.raises(ValueError, match=r"values from -1 to -1, expected finite ones >= 0"):
         defocus(x, inverse_depth=-torch.ones(2, 1, 8, 8))

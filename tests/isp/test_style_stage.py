@@ -204,7 +204,7 @@ def test_noise_is_drawn_out_by_the_convolution(size: tuple[int, int]) -> None:
 
 
 def test_whole_numbers_are_no_picture() -> None:
-    with pytest.raises(TypeError, match=r"got torch.uint8. Use picture / 255"):
+    with pytest.raises(TypeError, match=r"of torch.uint8. Use signal.float\(\) / 255"):
         StyleStage()(torch.full((1, 3, 8, 8), 200, dtype=torch.uint8))
 
 

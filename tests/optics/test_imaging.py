@@ -781,9 +781,9 @@ BAD = [
     (lambda: imaging(max_memory=0), ValueError, r"max_memory must be a positive number of bytes, got 0"),
     (lambda: imaging(fill_factor=0.0), ValueError, r"fill_factor 0 must be in \(0, 1\]"),
     (lambda: imaging(psf_shape=(9, 0)), ValueError, r"must be two positive integers \(H, W\).*\(9, 0\)"),
-    (lambda: imaging()(torch.zeros(28, 9, 9)), ValueError, r"takes a Scene or bands \(B, L, H, W\), got \(28, 9, 9\)"),
-    (lambda: imaging()([1.0]), ValueError, r"takes a Scene or bands \(B, L, H, W\), got list"),
-    (lambda: imaging()(torch.zeros(1, 3, 9, 9)), ValueError, r"3 bands do not match 28 wavelengths; give a Scene"),
+    (lambda: imaging()(torch.zeros(28, 9, 9)), ValueError, r"\(28, 9, 9\), expected \(B,L,H,W\) .* Use bands\[None\]"),
+    (lambda: imaging()([1.0]), TypeError, r"floating-point tensor \(B,L,H,W\), got a list"),
+    (lambda: imaging()(torch.zeros(1, 3, 9, 9)), ValueError, r"with 28 bands, .* a picture: use Scene.from_rgb\(bands"),
     (
         lambda: optics.Imaging(
             optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), sensor_distance=40 * mm)

@@ -122,10 +122,10 @@ def test_natural_is_that_of_the_builtin_photographs(features: SteerableFeatures)
     [
         (torch.rand(1, 3, 72, 64), ValueError, "of 72 x 64 has no features: both sides must be multiples of 16"),
         (torch.rand(1, 3, 150, 30), ValueError, "at least 64 pixels. Crop or resize it, to 144 x 64 for instance."),
-        (torch.rand(3, 64, 64), ValueError, "pictures (B,3,H,W), got shape (3, 64, 64). Add the batch: picture[None]."),
+        (torch.rand(3, 64, 64), ValueError, "pictures (B,3,H,W), got shape (3, 64, 64). Use picture[None]."),
         (torch.rand(1, 1, 64, 64), ValueError, "features are taken of pictures (B,3,H,W), got shape (1, 1, 64, 64)."),
-        (torch.ones(1, 3, 64, 64).byte(), TypeError, "of a floating-point picture (B,3,H,W), got torch.uint8."),
-        (np.ones((1, 3, 64, 64)), TypeError, "of a floating-point picture (B,3,H,W), got ndarray."),
+        (torch.ones(1, 3, 64, 64).byte(), TypeError, "floating-point tensor (B,3,H,W), got a tensor (1, 3, 64, 64) of"),
+        (np.ones((1, 3, 64, 64)), TypeError, "got an array (1, 3, 64, 64) of float64. Use torch.from_numpy("),
     ],
 )  # fmt: skip
 def test_wrong_pictures(features: SteerableFeatures, picture: object, error: type[Exception], message: str):
@@ -278,10 +278,10 @@ def test_features_of_inference_serve_training_too() -> None:
 @pytest.mark.parametrize(
     ("photo", "error", "match"),
     [
-        (torch.full((3, 80, 80), 200, dtype=torch.uint8), TypeError, "a photo is a floating-point picture"),
-        (torch.full((3, 80, 80), 200.0), ValueError, r"a photo has values in \[0,1\], got 200 to 200"),
-        (torch.full((3, 80, 80), math.nan), ValueError, r"a photo has values in \[0,1\], got nan"),
-        (torch.zeros(3, 0, 80), ValueError, r"a photo is one picture \(3,H,W\), got shape"),
+        (torch.full((3, 80, 80), 200, dtype=torch.uint8), TypeError, "photo must be .* Use photo.float"),
+        (torch.full((3, 80, 80), 200.0), ValueError, r"values from 200 to 200, .* Use photo / 255"),
+        (torch.full((3, 80, 80), math.nan), ValueError, "photo has values from nan to nan, .* Remove NaN"),
+        (torch.zeros(3, 0, 80), ValueError, r"photo has shape \(3, 0, 80\), expected 3 channels"),
     ],
 )
 def test_paint_refuses_what_is_no_photo(photo: torch.Tensor, error: type[Exception], match: str) -> None:

@@ -436,13 +436,13 @@ def test_style_crops_cover_the_picture_at_its_own_pixels():
 @pytest.mark.parametrize(
     ("picture", "error", "message"),
     [
-        (np.ones((3, 64, 64)), TypeError, "a style is a floating-point picture (3,H,W) in [0,1], got ndarray."),
-        (torch.ones(3, 64, 64).byte(), TypeError, "is a floating-point picture (3,H,W) in [0,1], got torch.uint8."),
-        (torch.ones(1, 3, 64, 64), ValueError, "a style is one picture (3,H,W), got shape (1, 3, 64, 64)."),
-        (torch.ones(64, 64, 3), ValueError, "a style is one picture (3,H,W), got shape (64, 64, 3)."),
-        (255 * torch.ones(3, 64, 64), ValueError, "in [0,1], got 255 to 255. Use picture.clamp(0, 1), or / 255."),
-        (-torch.ones(3, 64, 64), ValueError, "a style has values in [0,1], got -1 to -1."),
-        (torch.full((3, 64, 64), math.nan), ValueError, "a style has values in [0,1], got nan to nan."),
+        (np.ones((3, 64, 64)), TypeError, "tensor (3,H,W) in [0,1], got an array (3, 64, 64) of float64."),
+        (torch.ones(3, 64, 64).byte(), TypeError, "(3, 64, 64) of torch.uint8. Use picture.float() / 255."),
+        (torch.ones(1, 3, 64, 64), ValueError, "shape (1, 3, 64, 64), expected 3 channels: (C,H,W)."),
+        (torch.ones(64, 64, 3), ValueError, "channels last: use picture.permute(2, 0, 1)."),
+        (255 * torch.ones(3, 64, 64), ValueError, "values from 255 to 255, expected sRGB in [0,1]. Use picture / 255."),
+        (-torch.ones(3, 64, 64), ValueError, "values from -1 to -1, expected sRGB in [0,1]. Probably scaled to [-1,1]"),
+        (torch.full((3, 64, 64), math.nan), ValueError, "values from nan to nan, expected sRGB in [0,1]. Remove NaN"),
         (torch.ones(3, 63, 200), ValueError, "63 x 200 is too small: its features need at least 64 pixels each way."),
     ],
 )
