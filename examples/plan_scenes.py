@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcam import Camera, Plan, Scene, isp, measure, optics, plots, sensor
+from kcam import Camera, Plan, Scene, isp, optics, plots, sensor, threads
 from kcam.units import mm, um
 
 TOLERANCES = (0.1, 0.03, 0.01)
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=240)
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad(), measure.one_thread():
+    with torch.no_grad(), threads.fixed(1):
         motorcycle, near = Scene.builtin("motorcycle", options.size), camera(focus=2.3)
         plans = [near.explain(motorcycle, tolerance=tolerance, measure=True) for tolerance in TOLERANCES]
         pictures = [shot(plan.apply(near), motorcycle) for plan in plans] + [shot(near, motorcycle)]

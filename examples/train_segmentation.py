@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import kcam.augmentation as KC
-from kcam import Camera, Scene, isp, measure, optics, sensor
+from kcam import Camera, Scene, isp, measure, optics, sensor, threads
 from kcam.units import mm, um
 
 SIDE, BATCH = 48, 16
@@ -157,7 +157,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.quick:
         options.steps, options.seeds, options.pictures = 4, 2, 4
     rows: list[dict[str, Any]] = []
-    with measure.one_thread(), torch.random.fork_rng():
+    with threads.fixed(1), torch.random.fork_rng():
         environment = measure.environment()
         pictures = tests(options.pictures)
         for name, regime in REGIMES.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import os
 from collections.abc import Sequence
@@ -79,7 +80,8 @@ class BuiltinScenes:
             planes.append(crop.flip(-1) if random.integers(2) else crop)
             origins.append(f"{name}, row {top}, column {left}")
         _, first = self.scenes[0]
-        return Scene(torch.cat(planes), first.spectra, first.wavelengths, DISTANCE, first.illuminant), origins
+        spectra, wavelengths, light = copy.deepcopy((first.spectra, first.wavelengths, first.illuminant))
+        return Scene(torch.cat(planes), spectra, wavelengths, DISTANCE, light), origins
 
 
 @functools.lru_cache(maxsize=32)

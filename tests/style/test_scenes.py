@@ -86,6 +86,16 @@ def test_scenes_are_light(source: Source) -> None:
         assert scene.coefficients.dtype == torch.float32
 
 
+def test_a_drawn_scene_may_be_changed(builtin: BuiltinScenes) -> None:
+    """The photographs are kept for all who draw from them."""
+    before, _ = builtin.draw([0], seed=1, step=0)
+    for tensor in (before.coefficients, before.spectra, before.wavelengths, before.illuminant):
+        tensor.mul_(0)
+    after, _ = builtin.draw([0], seed=1, step=0)
+    for tensor in (after.coefficients, after.spectra, after.wavelengths, after.illuminant):
+        assert tensor.abs().max() > 0
+
+
 def test_what_an_epoch_is(builtin: BuiltinScenes, store: Path) -> None:
     assert len(PatchScenes(store)) == 3 * 24
     assert len(builtin) > len(BuiltinScenes(96)) > 0
