@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -113,8 +114,8 @@ class Imaging(Stage):
             raise ValueError(f"unknown border {border!r}; known: {', '.join(BORDERS)}.")
         if coverage not in COVERAGES:
             raise ValueError(f"unknown coverage {coverage!r}; known: {', '.join(COVERAGES)}.")
-        if layers is not None and not isinstance(layers, int):
-            layers = _distances(layers)
+        if layers is not None:
+            layers = int(layers) if isinstance(layers, int | Integral) else _distances(layers)
         for name, value, of in (
             ("layers", layers if isinstance(layers, int) else None, "depth layers"),
             ("bands", bands, "wavelengths"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -164,6 +165,20 @@ def test_few_distances_are_layers_of_their_own(distances: tuple[float, ...]) -> 
         assert torch.equal(imaging(layers=given)(scene), stage(scene))
     fine = imaging(layers=2000)(scene)  # 0.01 waves apart
     assert float((stage(scene) - fine).abs().max() / fine.max()) < 2e-3
+
+
+def test_a_number_is_a_number_of_layers_whoever_counted() -> None:
+    assert imaging(layers=np.int64(3)).layers == 3
+    assert imaging(layers=3.0).layers == (3.0,)
+    assert imaging(layers=np.array([1.0, 3.0])).layers == (3.0, 1.0)
+
+
+def test_a_camera_of_given_distances_is_planned() -> None:
+    scene = scene_of(planes_of(0.7, 1.1, 5.0), bands=6)
+    camera = Camera(imaging(layers=(0.7, 1.1, 5.0)), ColourFilter.kodak())
+    plan = camera.plan(scene, tolerance=0.01)
+    found, truth = plan.apply(camera)(scene), camera(scene)
+    assert float((found - truth).detach().norm() / truth.detach().norm()) < 0.01
 
 
 def test_a_map_that_trains_is_cut_into_equal_steps() -> None:
