@@ -14,9 +14,9 @@ from kcam.optics import sampling
 from kcam.optics.autograd import once_differentiable
 from kcam.optics.elements import zernike_sum
 from kcam.optics.pixels import Pixels
-from kcam.optics.polar import legendre
 from kcam.optics.pupil import Pupil, disc_weights, grid_nodes, grid_spacing
 from kcam.optics.quadrants import unfold
+from kcam.optics.rings import legendre
 from kcam.optics.transforms import MatrixTransform, pupil_intensity
 from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 

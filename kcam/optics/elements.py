@@ -8,6 +8,7 @@ Pixel maps cannot be sampled like smooth paths; they come as `PixelMap` and pass
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,7 +71,10 @@ class Element(nn.Module):
     """A thin element of a lens. Subclasses override what they do; by default an element does nothing.
 
     A subclass whose terms are rotationally symmetric says `symmetric = True` beside them: then a Hankel transform may
-    take the place of the grid, and one quadrant that of four.
+    take the place of the grid, and one quadrant that of four. `knots` are the radii, relative to the semi-aperture,
+    between which symmetric terms are smooth: () where they are smooth everywhere, and None where that is not known, as
+    for terms of a subclass that does not say. Then the values tell, halved panel by panel; gradients to more than 500
+    rings need the knots.
 
     What the methods of one's own class read cannot be known, so PSFs of a lens that has one are computed anew for each
     picture. A class that says `pure = True` in its own body promises that all its methods, inherited ones too, are a
@@ -80,13 +84,17 @@ class Element(nn.Module):
     """
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric
+    knots: Sequence[float] | Tensor | None = ()
     focuses = True  # whether its vergence counts when the sensor is put in focus; a deliberate defocus must not
 
     def __init_subclass__(cls, **arguments: Any) -> None:
-        """Terms of its own are not symmetric until the subclass says so: what it inherits was said of others."""
+        """Terms of its own are neither symmetric nor smooth until the subclass says so: what it inherits was said of
+        others.
+        """
         super().__init_subclass__(**arguments)
-        if "terms" in vars(cls) and "symmetric" not in vars(cls):
-            cls.symmetric = False
+        if "terms" in vars(cls):
+            cls.symmetric = vars(cls).get("symmetric", False)
+            cls.knots = vars(cls).get("knots")
 
     def vergence(self, wavelengths: Tensor) -> Tensor:
         """Coefficient of r^2 / 2 in the OPD, (L,) float64 [1/m]; a converging lens has -1 / f."""
@@ -274,7 +282,7 @@ class ThinLens(Element):
     Raises:  ValueError for 0, NaN or inf, or above 10 m (millimetres by mistake; a tenth of a dioptre is a `Defocus`).
     """
 
-    symmetric = True
+    symmetric, knots = True, ()
     focal_length: Scalar
 
     def __init__(self, focal_length: Scalar) -> None:
@@ -318,7 +326,7 @@ class PlanoConvexLens(Element):
     Source:  Goodman, Introduction to Fourier Optics, 3rd ed., section 5.1; thesis (3.7).
     """
 
-    symmetric = True
+    symmetric, knots = True, ()
     radius_of_curvature: Scalar
 
     def __init__(self, radius_of_curvature: Scalar, *, glass: str | float = "N-BK7") -> None:
@@ -492,12 +500,17 @@ class RadialDOE(Element):
         set_tensor(self, "profile", profile)
         self.design_wavelength, self.glass = float(design_wavelength), glass
 
+    @property
+    def knots(self) -> Tensor:  # type: ignore[override]
+        """The radii of the profile."""
+        return torch.linspace(0, 1, self.profile.numel(), dtype=torch.float64)
+
     def terms(self, pupil: Pupil, wavelengths: Tensor) -> list[Term]:
         factors = _diffractive_factors(self.design_wavelength, self.glass, wavelengths)
         return [
             (
                 factors * wavelengths / (2 * torch.pi),
-                _radial_cubic(float64(self.profile).to(pupil.rho2.device), pupil.rho2),
+                _radial_cubic(float64(self.profile).to(pupil.rho2.device), pupil),
             )
         ]
 
@@ -518,16 +531,23 @@ def _diffractive_factors(design_wavelength: float, glass: str | float, wavelengt
     return float(design) * (index - 1) / (wavelengths * (design_index - 1))
 
 
-def _radial_cubic(profile: Tensor, rho2: Tensor) -> Tensor:
-    """Catmull-Rom interpolation of a profile over rho in [0, 1], held beyond; mirrored at the axis."""
+def _radial_cubic(profile: Tensor, pupil: Pupil) -> Tensor:
+    """Catmull-Rom interpolation of a profile over rho in [0, 1], mirrored at the axis.
+
+    Beyond the rim it is held, as in the corners of a square aperture; of a round one only low-passed edges are left
+    there, which ask for a path that goes on as it ends.
+    """
     n = profile.numel()
     # the floor keeps d rho / d rho2 finite on the axis, where the mirrored profile is flat anyway
-    position = torch.sqrt(torch.clamp(rho2, 1e-24, 1.0)) * (n - 1)
+    position = torch.sqrt(torch.clamp(pupil.rho2, min=1e-24)) * (n - 1)
     low = torch.clamp(position.detach().floor().long(), max=n - 2)
-    t = position - low
+    t = torch.clamp(position - low, max=1.0)
     padded = torch.cat([profile[1:2], profile, (2 * profile[-1:] - profile[-2:-1])])
     p0, p1, p2, p3 = (padded[low + i] for i in range(4))
-    return p1 + t / 2 * (p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)))
+    cubic = p1 + t / 2 * (p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)))
+    if not pupil.round:
+        return cubic
+    return cubic + (profile[-1] - profile[-2]) * torch.clamp(position - (n - 1), min=0)
 
 
 def noll_indices(j: int) -> tuple[int, int]:

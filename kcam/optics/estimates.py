@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from kcam.optics.cells import sizes
-from kcam.optics.psf import Query, residual_path
+from kcam.optics.psf import Query, radial_phase, residual_path
 from kcam.optics.pupil import FINE, edge_response, from_image_side, map_response
 
 _SIDE = 65  # of the grid on which rays are traced
+_NEAR = 1e-5  # of the semi-aperture: the step over which a slope is taken
 _RADII = 96  # of the window over which errors are summed
 _QUANTILES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.0)  # of the rim's displacements
 _SAFETY = 1.7  # for light that caustics heap up where the rim's loss is largest: 4 times too small without, at worst
@@ -50,28 +51,30 @@ def trace(query: Query) -> list[Rays]:
         vergences = torch.stack([vergences.min(), vergences.max(), nearest]).unique()
         side = torch.linspace(-1, 1, _SIDE, dtype=torch.float64, device=query.device)
         exact = replace(query, wavelengths=wavelengths, vergences=vergences, paraxial=False)
-        x, y = side[None, :], side[:, None]
-        tau = exact.tau
-        coefficients, maps = residual_path(exact, exact.pupil(*from_image_side(x, y, tau)))
-        paths = torch.einsum("lzt,tvu->lzvu", coefficients, maps)
         flat = replace(exact, paraxial=True)
-        coefficients, maps = residual_path(flat, flat.pupil(x, y))
-        beyond = paths - torch.einsum("lzt,tvu->lzvu", coefficients, maps)
+        x, y = side[None, :], side[:, None]
+
+        def path(right: float, down: float) -> torch.Tensor:
+            pupil = exact.pupil(*from_image_side(x + right, y + down, exact.tau))
+            return torch.einsum("lzt,tvu->lzvu", *residual_path(exact, pupil))
+
+        paths = path(0, 0)
+        # from so near that a profile of rings has the slope that it has there, not the mean over several
+        slopes = [(path(*step) - path(*(-s for s in step))) / (2 * _NEAR) for step in ((_NEAR, 0.0), (0.0, _NEAR))]
+        beyond = paths - torch.einsum("lzt,tvu->lzvu", *residual_path(flat, flat.pupil(x, y)))
 
         rho2 = x**2 + y**2
         open_part = rho2 <= 1.0001 if query.lens.round else torch.ones_like(rho2, dtype=torch.bool)
         rim = open_part & (rho2 > 0.9 if query.lens.round else torch.maximum(x.abs(), y.abs()) > 0.9)
-        step = float(side[1] - side[0]) * float(query.semi_aperture)
-        d = float(query.sensor_distance)
+        displacements = torch.hypot(*slopes) * float(query.sensor_distance / query.semi_aperture)
         found = []
         for index, wavelength in enumerate(wavelengths.tolist()):
             wavenumber = 2 * math.pi / wavelength
-            for vergence, path, rest in zip(vergences.tolist(), paths[index], beyond[index], strict=True):
-                slopes = torch.gradient(path, spacing=step)
-                displacement = d * torch.hypot(*slopes)
+            each = zip(vergences.tolist(), displacements[index], paths[index], beyond[index], strict=True)
+            for vergence, displacement, whole, rest in each:
                 rms = float(displacement[open_part].square().mean().sqrt())
                 quantiles = np.quantile(displacement[rim].cpu().numpy(), _QUANTILES)
-                phase, left_out = (wavenumber * float(part[open_part].std()) for part in (path, rest))
+                phase, left_out = (wavenumber * float(part[open_part].std()) for part in (whole, rest))
                 found.append(Rays(wavelength, vergence, rms, quantiles, phase, left_out))
         return found
 
@@ -105,7 +108,48 @@ def grid_error(query: Query, rays: Rays, *, period: float) -> float:
     wrong = sum(2 * np.sqrt(light) * loss + loss**2 for loss in losses)
     captured = min(1.0, float((light * r).sum()) * 2 * math.pi * edge / _RADII)
     of_maps = _map_error(query, wavelength=rays.wavelength, period=period, captured=captured)
-    return _SAFETY * float((wrong * r).sum() / (light * r).sum()) + of_maps
+    of_rings = _ring_error(query, wavelength=rays.wavelength, period=period, captured=captured)
+    return _SAFETY * float((wrong * r).sum() / (light * r).sum()) + of_maps + of_rings
+
+
+def debye_error(query: Query, rays: Rays) -> float:
+    """What the Debye map leaves out of Rayleigh-Sommerfeld's kernel, over the light in the window of a query.
+
+        |R - d| + x u / R_0 = x^2 / 2 R_0 + x^2 (x u) / 2 R_0^3 - (x u)^2 / 2 R_0^3 + ...
+
+    At a radius r of the sensor the pupil's rim is thus off by a phase of k a r^2 (r + a) / 2 d^3, and the amplitude by
+    r (r + a) / d^2, relatively: nothing on the axis, whatever the f-number, and more the wider the light spreads. The
+    field of a round pupil in focus is real: what a adds to it is imaginary then, and counts by its square.
+    """
+    d, a = float(query.sensor_distance.detach()), float(query.semi_aperture.detach())
+    edge = query.pixel_pitch * max(query.shape) / 2 * math.sqrt(4 / math.pi)  # of a disc as large as the window
+    share = ((np.arange(_RADII) + 0.5) / _RADII) ** 2  # a core in focus is far smaller than the window
+    r = share * edge
+    ring = r * np.sqrt(share)
+    light = _light(query, rays, r)
+    phase = math.pi / rays.wavelength * a * r**2 / d**3
+    aside = phase * a + r * a / d**2
+    if query.lens.round and not query.lens.has_pixel_phase:
+        aside = aside * np.minimum(1.0, aside + rays.phase)
+    wrong = np.minimum(2.0, phase * r + r**2 / d**2 + aside)
+    return float((wrong * light * ring).sum() / (light * ring).sum())
+
+
+def _light(query: Query, rays: Rays, r: np.ndarray) -> np.ndarray:
+    """Irradiance at radii on the sensor, roughly: what the path spreads, and the tail that the rim diffracts."""
+    d, a = float(query.sensor_distance.detach()), float(query.semi_aperture.detach())
+    airy = rays.wavelength * d / (2 * a)
+    blur = max(math.sqrt(2) * rays.rms, query.lens.pixel_phase_displacement(query), airy / 2)
+    spread = np.where(r < blur, 1 / (math.pi * blur**2), 0.0)
+    if query.scatter is not None:
+        frequency = np.linspace(0, 1.01, 4 * _RADII) * r[-1] * a / (rays.wavelength * d)
+        beyond = np.array([float(query.scatter.share(f).max()) for f in frequency])
+        radii = frequency * rays.wavelength * d / a
+        density = -np.diff(beyond) / (math.pi * np.diff(radii**2))
+        spread = spread + np.interp(r, (radii[1:] + radii[:-1]) / 2, density)
+    beyond_rays = np.maximum(r - rays.rim.max(), 0)
+    tail = airy * a * query.lens.aperture.rim_per_area() / (2 * math.pi**3)
+    return spread + tail / ((r + airy / 2) * (beyond_rays**2 + airy**2))
 
 
 def _cell_response(frequency: np.ndarray) -> np.ndarray:
@@ -116,6 +160,29 @@ def _cell_response(frequency: np.ndarray) -> np.ndarray:
 def _from_rim(distance: np.ndarray, r: np.ndarray, airy: float) -> np.ndarray:
     """Irradiance of one side of the rim, averaged over its fringes and finite where the ray itself lands."""
     return airy / (2 * math.pi**3) / ((distance**2 + airy**2 / 4) * (r + airy / 2))
+
+
+def _ring_error(query: Query, *, wavelength: float, period: float, captured: float) -> float:
+    """What the structure of the radius scatters beyond the period, folded back: 2 Re(u* du) of the field in the window.
+
+    Its power spreads over the period's square; 100 times that (a fit), for it leaves out the outermost rings, which may
+    be the finest.
+    """
+    if query.scatter is None:
+        return 0.0
+    scale = float(query.semi_aperture.detach()) / (wavelength * float(query.sensor_distance.detach()))
+    share = float(query.scatter.share((period - query.half_window) * scale).max())
+    folded = 100 * share * min(1.0, 2 * query.half_window / period) ** 2 / captured
+    return 2 * min(1.0, math.sqrt(folded))
+
+
+def ring_turns(query: Query) -> float:
+    """The rms by which the phase turns from one panel of the radius to the next [rad]; 0 without rings."""
+    if query.scatter is None:
+        return 0.0
+    edges, widths = query.panels, query.panels.diff()
+    slopes = radial_phase(query)(edges).diff(dim=-1) / widths
+    return float((slopes.diff(dim=-1) * torch.minimum(widths[1:], widths[:-1])).square().mean(-1).max().sqrt())
 
 
 def _map_error(query: Query, *, wavelength: float, period: float, captured: float) -> float:

@@ -32,7 +32,7 @@ class Explanation:
 
     propagator, method: the row chosen. samples: fewest and most across the pupil over the wavelengths, None without a
     grid. points_per_pixel: on each axis, likewise. error: estimated L1 error of the worst PSF against the reference.
-    model_error: estimated L1 error of the reference against Rayleigh-Sommerfeld.
+    model_error: estimated L1 error of the reference against Rayleigh-Sommerfeld, over this window.
     wavelengths (L',) [m], distances (Z',) [m], energy (Z', L'): share of the light that the window captures, computed
     at the shortest and longest wavelength, at the nearest, farthest and best focused distance.
     candidates: every row of the table.

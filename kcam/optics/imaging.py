@@ -194,14 +194,15 @@ class Imaging(Stage):
         """Window of the PSF in pixels: at most 0.1 % of the light outside, or the window is the picture.
 
         Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a
-        rim of length P around an area A spreads beyond a radius.
+        rim of length P around an area A spreads beyond a radius. Profiles of rings scatter light beyond their rays:
+        then the blur holds all but a tenth of the share.
         """
         if not self.blur:
             return 1, 1
         if self.psf_shape is not None:
             return self.psf_shape
         query = self._query(wavelengths, vergences, (1, 1), torch.empty(0, dtype=torch.float64))
-        blur = float((query.displacement + self.lens.pixel_phase_displacement(query)).max())
+        blur = float((query.spread(OUTSIDE_SHARE / 10) + self.lens.pixel_phase_displacement(query)).max())
         tail = float(wavelengths.max()) * float(query.sensor_distance.detach()) / (2 * math.pi**2 * OUTSIDE_SHARE)
         half = math.ceil((blur + tail * self.lens.aperture.rim_per_area()) / self.pixel_pitch)
         height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)

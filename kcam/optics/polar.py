@@ -10,16 +10,15 @@ import functools
 import math
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from kcam.optics.psf import Query, residual_path
+from kcam.optics.psf import Query, radial_phase, residual_path
 from kcam.optics.pupil import Pupil, from_image_side
+from kcam.optics.rings import fewer_nodes, panel_nodes, panel_orders
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
-_PANEL = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
 _MOST_RINGS = 2**20
 _RINGS_AT_ONCE = 2**24  # entries of the Hankel table: 128 MB
 
@@ -34,10 +33,8 @@ def radial_psf(query: Query) -> Tensor:
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
     largest = float(scales.detach().max())
-    displacement = float(query.displacement.max())
     corner = math.sqrt(2) * query.half_window
-    count = math.ceil(largest * (corner + displacement) / 2) + 32
-    rho, weights = ring_nodes(query, count)
+    rho, weights = ring_nodes(query, largest * corner)
 
     x, y = from_image_side(rho, torch.zeros_like(rho), query.tau)
     pupil = query.pupil(x, y)
@@ -45,6 +42,7 @@ def radial_psf(query: Query) -> Tensor:
     phase = 2 * math.pi / wavelengths[:, None, None] * (coefficients @ maps)  # (L, Z, n)
     amplitude, energy = ring_amplitude(query, pupil, rho * weights)
     field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
+    field, rho = fewer_nodes(field, rho, frequency=largest * corner)
 
     t = torch.arange(math.ceil(largest * corner / _TABLE_STEP) + 8, dtype=torch.float64, device=query.device)
     parts = list(zip(*(part.split(max(1, _RINGS_AT_ONCE // t.numel()), dim=-1) for part in (field, rho)), strict=True))
@@ -72,7 +70,7 @@ def _hankel(field: Tensor, t: Tensor, rho: Tensor) -> Tensor:
 
 
 class _BesselJ0(torch.autograd.Function):
-    """J0 with its derivative -J1, which torch.special leaves out without a word."""
+    """J0 with its derivative -J1, which torch.special leaves out without a word; any number of times."""
 
     @staticmethod
     def forward(ctx, x):
@@ -82,32 +80,45 @@ class _BesselJ0(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         (x,) = ctx.saved_tensors
-        return -grad * torch.special.bessel_j1(x)
+        return -grad * _BesselJ1.apply(x)
 
 
-def ring_nodes(query: Query, count: int) -> tuple[Tensor, Tensor]:
-    """Gauss-Legendre nodes and weights over the open part of the radius, image-side coordinates."""
-    if count > _MOST_RINGS:
-        raise ValueError(
-            f"this PSF needs {count} rings of the pupil, more than {_MOST_RINGS}: rays at the rim of the lens are sent "
-            "too far beyond the window. Use a smaller aperture or a larger radius of curvature."
-        )
-    nodes, weights = (torch.as_tensor(v, device=query.device) for v in legendre(count))
+class _BesselJ1(torch.autograd.Function):
+    """J1 with its derivative J0 - J1(x) / x."""
+
+    @staticmethod
+    def forward(ctx, x):
+        ctx.save_for_backward(x)
+        return torch.special.bessel_j1(x)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (x,) = ctx.saved_tensors
+        near = x.abs() < 1e-3  # where the quotient's own derivatives would cancel: its series, to 1e-20
+        ratio = _BesselJ1.apply(x) / torch.where(near, 1, x)
+        series = 0.5 - x**2 / 16 + x**4 / 384
+        return grad * (_BesselJ0.apply(x) - torch.where(near, series, ratio))
+
+
+def ring_nodes(query: Query, frequency: float, *, density: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Gauss-Legendre nodes and weights over the open part of the radius, image-side coordinates.
+
+    Args: frequency: of the kernel, in radians per image-side semi-aperture; density: of the nodes, relative to what
+    converges to 1e-9.
+    """
     discs = query.lens.aperture.discs()
-    inner = torch.zeros_like(query.tau) + (discs[1][0] if len(discs) > 1 else 0.0)
-    if len(discs) > 1:
-        inner = inner * torch.sqrt((1 + query.tau) / (1 + query.tau * inner**2))
-    return inner + (1 - inner) * (nodes + 1) / 2, weights * (1 - inner) / 2
-
-
-@functools.lru_cache(maxsize=16)
-def legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on [-1, 1]: one rule, or panels of one rule that together resolve as much."""
-    panels = math.ceil(count / _PANEL)
-    order = count if panels == 1 else math.ceil(count / panels) + 32
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    centres = (2 * np.arange(panels) + 1) / panels - 1
-    return (centres[:, None] + nodes / panels).ravel(), np.tile(weights / panels, panels)
+    inner = discs[1][0] if len(discs) > 1 else 0.0
+    edges = query.panels
+    edges = torch.cat([edges.new_full((1,), inner), edges[edges > inner]])
+    orders = panel_orders(edges, radial_phase(query), frequency=frequency, density=density)
+    if float(orders.sum()) > _MOST_RINGS:
+        raise ValueError(
+            f"this PSF needs {float(orders.sum()):.3g} rings of the pupil, more than {_MOST_RINGS}: rays at the rim of "
+            "the lens are sent too far beyond the window. Use a smaller aperture or a larger radius of curvature."
+        )
+    # edges move with tau, for a step there moves light; 0 and 1 do not, and nodes without a gradient cost less
+    tau = query.tau if edges.numel() > 2 or inner > 0 else query.tau.detach()
+    return panel_nodes(edges * torch.sqrt((1 + tau) / (1 + tau * edges**2)), orders)
 
 
 def ring_amplitude(query: Query, pupil: Pupil, quadrature: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,7 +178,7 @@ def polar_psf(query: Query, *, density: float = 1.0) -> Tensor:
     for index, wavelength in enumerate(query.wavelengths.tolist()):
         scale = 2 * math.pi / wavelengths[index] * a / d
         fringes = float(scale.detach()) * (math.sqrt(2) * query.half_window + float(displacement[index]))
-        rho, weights = ring_nodes(query, math.ceil(density * (0.75 * fringes + 48)))
+        rho, weights = ring_nodes(query, fringes, density=1.5 * density)
         angles = 2 * math.ceil(density * (1.2 * fringes + 32))
         theta = torch.arange(angles, dtype=torch.float64, device=query.device) * (2 * math.pi / angles)
         xi, eta = (rho[:, None] * theta.cos()).flatten(), (rho[:, None] * theta.sin()).flatten()

@@ -13,7 +13,7 @@ from dataclasses import replace
 from torch import Tensor, nn
 
 from kcam.optics.angular_spectrum import angular_spectrum_psf, spectrum_grids
-from kcam.optics.estimates import ROUNDING, Rays, grid_error, jumps, map_phase, trace
+from kcam.optics.estimates import ROUNDING, Rays, debye_error, grid_error, jumps, map_phase, ring_turns, trace
 from kcam.optics.polar import radial_psf
 from kcam.optics.psf import Query, fft_grid_for, grid_psf, samples_by_rule
 from kcam.optics.pupil import EDGE_MARGIN
@@ -80,8 +80,12 @@ class Propagator(nn.Module):
         return self.error_of(_as(query, paraxial=self.paraxial))
 
     def model_error(self, query: Query) -> float:
-        """Estimated L1 error that the reference itself has against Rayleigh-Sommerfeld, on the axis."""
-        return _debye_error(query)
+        """Estimated L1 error of the reference itself against Rayleigh-Sommerfeld, over the window of the query.
+
+        Never more than 3 times too small (above 1e-6), 3 times too large in the median of random lenses: see
+        `estimates.debye_error`.
+        """
+        return min(2.0, max(debye_error(query, rays) for rays in trace(query)))
 
     def cost(self, query: Query) -> float:
         """Estimated floating-point operations, weighted by how fast the row's kind of work runs."""
@@ -91,19 +95,6 @@ class Propagator(nn.Module):
 def _as(query: Query, *, paraxial: bool) -> Query:
     """The query for a model; the same one where it is for it already, with what it has kept."""
     return query if query.paraxial == paraxial else replace(query, paraxial=paraxial)
-
-
-def wave_front_error(query: Query) -> float:
-    """w4 = a^4 / (8 d^3 lambda): waves that a converging sphere has beyond its parabola, the Fresnel model's
-    measure.
-    """
-    a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
-    return a**4 / (8 * d**3 * float(query.wavelengths.min()))
-
-
-def _debye_error(query: Query) -> float:
-    """0.013 w4: what the Debye map itself is off Rayleigh-Sommerfeld (numerics note, section 3)."""
-    return 0.013 * wave_front_error(query)
 
 
 def _paraxial_error(rays: Rays, query: Query) -> float:
@@ -256,8 +247,11 @@ def _needs_smooth_path(query: Query) -> str | None:
 
 
 def _geometric_estimate(query: Query) -> float:
-    """1.2 / (1 + phase / 3)^(1/3), phase the rms of the residual [rad]: the decay with waves of numerics note, 5.5."""
-    return max(1.2 / (1 + rays.phase / 3) ** (1 / 3) for rays in trace(query))
+    """1.2 / (1 + phase / 3)^(1/3), phase the rms of the residual [rad]: the decay with waves of numerics note, 5.5.
+
+    Rings between which the phase turns have no rays of their own: twice the turn is added.
+    """
+    return min(2.0, max(1.2 / (1 + rays.phase / 3) ** (1 / 3) for rays in trace(query)) + 2 * ring_turns(query))
 
 
 def _rows() -> dict[tuple[str, str], Propagator]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -33,6 +33,7 @@ from kcam.optics.pupil import (
     pupil_tau,
 )
 from kcam.optics.quadrants import unfold
+from kcam.optics.rings import Scatter, panels_of, scatter
 from kcam.optics.transforms import (
     ChirpZTransform,
     Curvature,
@@ -47,8 +48,10 @@ from kcam.optics.transforms import (
 from kcam.optics.warp import Warp
 
 if TYPE_CHECKING:
+    from kcam.optics.elements import Element
     from kcam.optics.lens import Lens
 
+_SPREAD = 1e-6  # share of the light that the structure of a radius may send beyond the displacement that is sampled
 _GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
 
 
@@ -140,9 +143,27 @@ class Query:
     def displacement(self) -> Tensor:
         """How far the smooth part of the pupil sends its rays on the sensor, max d |grad W|, (L,) float64 [m].
 
-        Without a gradient; kept, because every row of the table that is priced asks for it.
+        Where a profile of rings is part of it, as far as that scatters all but 1e-6 of its light. Without a gradient;
+        kept, because every row of the table that is priced asks for it.
         """
-        return _ray_displacement(self)
+        return self.spread(_SPREAD)
+
+    def spread(self, share: float) -> Tensor:
+        """As `displacement`, for another share of the light that a profile of rings may scatter beyond it."""
+        return _ray_displacement(self, share)
+
+    @functools.cached_property
+    def panels(self) -> Tensor:
+        """Edges of the panels of the radius in which the rotationally symmetric path is smooth, from 0 to 1."""
+        return _panels(self)
+
+    @functools.cached_property
+    def scatter(self) -> Scatter | None:
+        """What the rings of the pupil scatter, at the outermost wavelengths and distances; None where it has none."""
+        if not self.lens.has_rings:
+            return None
+        with torch.no_grad():
+            return scatter(self.panels, radial_phase(self))
 
     def aperture_pixels(self) -> Tensor:
         """The transmission of an aperture that is a map of pixels, (n, n)."""
@@ -157,7 +178,7 @@ class Query:
 
     def pupil(self, x: Tensor, y: Tensor) -> Pupil:
         """The pupil at true normalised coordinates."""
-        return Pupil(x, y, self.semi_aperture, self.sensor_distance, self.paraxial)
+        return Pupil(x, y, self.semi_aperture, self.sensor_distance, self.paraxial, round=self.lens.round)
 
 
 # ---- the residual optical path -----------------------------------------------------------------------------------
@@ -169,11 +190,11 @@ def residual_vergence(query: Query) -> Tensor:
     return (lens + 1 / query.sensor_distance)[:, None] + query.vergences[None, :]
 
 
-def residual_path(query: Query, pupil: Pupil) -> tuple[Tensor, Tensor]:
+def residual_path(query: Query, pupil: Pupil, elements: Sequence[Element] | None = None) -> tuple[Tensor, Tensor]:
     """The residual OPD as (coefficients (L, Z, T), maps (T, ...)), W = coefficients . maps, both float64.
 
     The first map is rho^2 with V a^2 / 2; then what the image-side and the object-side sphere have beyond their
-    parabolas, then the elements' own terms. Pixel maps are not part of it.
+    parabolas, then the terms of the elements, or of those that are given. Pixel maps are not part of it.
     """
     wavelengths = query.wavelengths.to(query.device)
     bands, distances = wavelengths.numel(), query.vergences.numel()
@@ -187,34 +208,110 @@ def residual_path(query: Query, pupil: Pupil) -> tuple[Tensor, Tensor]:
             if differentiated(vergence) or float(vergence) != 0:
                 coefficients.append(ones * (torch.arange(distances, device=query.device) == index))
                 maps.append(pupil.beyond_paraxial(vergence))
-    for element in query.lens.elements:
+    for element in query.lens.elements if elements is None else elements:
         for coefficient, term in element.terms(pupil, wavelengths):
             coefficients.append(coefficient[:, None] * ones)
             maps.append(term)
+    return torch.stack(coefficients, dim=-1), _stacked(maps)
+
+
+def _stacked(maps: Sequence[Tensor]) -> Tensor:
     shape = torch.broadcast_shapes(*(m.shape for m in maps))
-    return torch.stack(coefficients, dim=-1), torch.stack([m.expand(shape) for m in maps])
+    return torch.stack([m.expand(shape) for m in maps])
 
 
-def _ray_displacement(query: Query) -> Tensor:
+def _outermost(query: Query) -> Query:
+    """The shortest and longest wavelength, the nearest and farthest distance; |grad W| is convex in the vergence."""
+    wavelengths = torch.stack([query.wavelengths.min(), query.wavelengths.max()]).unique()
+    vergences = query.vergences.detach()
+    return replace(query, wavelengths=wavelengths, vergences=torch.stack([vergences.min(), vergences.max()]).unique())
+
+
+def radial_phase(query: Query) -> Callable[[Tensor], Tensor]:
+    """The rotationally symmetric part of the residual phase at true radii (n,), (P, n) [rad], without a gradient.
+
+    P: the outermost wavelengths and distances.
+    """
+    outermost = _outermost(query)
+    elements = [element for element in query.lens.elements if element.symmetric]
+    wavenumbers = 2 * math.pi / outermost.wavelengths.to(query.device)
+
+    def phase(rho: Tensor) -> Tensor:
+        with torch.no_grad():
+            coefficients, maps = residual_path(outermost, query.pupil(rho, torch.zeros_like(rho)), elements)
+            return ((wavenumbers[:, None, None] * coefficients) @ maps).flatten(0, 1)
+
+    return phase
+
+
+def _panels(query: Query) -> Tensor:
+    wavelengths = _outermost(query).wavelengths.to(query.device)
+    known = [torch.tensor([0.0, 1.0], dtype=torch.float64)]
+    unknown = []
+    for element in query.lens.elements:
+        if element.symmetric and element.knots is None:
+            unknown.append(element)
+        elif element.symmetric:
+            known.append(torch.as_tensor(element.knots, dtype=torch.float64))
+    knots = torch.cat(known).to(query.device).unique()
+    knots = knots[(knots >= 0) & (knots <= 1)]
+
+    def phase(rho: Tensor) -> Tensor:
+        with torch.no_grad():
+            pupil = query.pupil(rho, torch.zeros_like(rho))
+            terms = [term for element in unknown for term in element.terms(pupil, wavelengths)]
+            found = [2 * math.pi / wavelengths[:, None] * c[:, None] * m for c, m in terms]
+            return torch.stack([path.expand(wavelengths.numel(), rho.numel()) for path in found])
+
+    if not unknown:
+        return knots
+    trained = any(p.requires_grad for element in unknown for p in element.parameters())
+    return panels_of(phase, knots, first=512 if trained else 32)  # a flat start tells nothing of what may grow
+
+
+def _ray_displacement(query: Query, share: float) -> Tensor:
+    """Of all elements together on a grid; where some are profiles of rings, of those along a radius and of the rest."""
+    lens, outermost = query.lens, replace(_outermost(query), wavelengths=query.wavelengths)
     with torch.no_grad():
-        extremes = query.vergences.detach()
-        if extremes.numel() > 2:
-            extremes = torch.stack([extremes.min(), extremes.max()])  # |grad W| is convex in the vergence
         side = torch.linspace(-1, 1, 97, dtype=torch.float64, device=query.device)
-        if query.lens.symmetric:
+        if lens.symmetric:
             side = side[48:]
             x, y = side, torch.zeros_like(side)
         else:
             x, y = side[None, :], side[:, None]
-        coarse = replace(query, vergences=extremes)
-        coefficients, maps = residual_path(coarse, query.pupil(x, y))
-        inside = (query.pupil(x, y).rho2 <= 1.0001) | (not query.lens.round)
+        pupil = query.pupil(x, y)
+        rings = query.wavelengths.new_zeros(query.wavelengths.numel())
+        if query.scatter is None:
+            coefficients, maps = residual_path(outermost, pupil)
+        else:
+            rings += _ring_displacement(query, share)
+            others = [element for element in lens.elements if not element.symmetric]
+            terms = [term for element in others for term in element.terms(pupil, query.wavelengths.to(query.device))]
+            if not terms:
+                return rings
+            coefficients = torch.stack([coefficient for coefficient, _ in terms], dim=-1)[:, None]
+            maps = _stacked([term for _, term in terms])
+        inside = (pupil.rho2 <= 1.0001) | (not lens.round)
         step = float(side[1] - side[0]) * float(query.semi_aperture)
         gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
         slope2 = torch.stack([(coefficients.flatten(0, 1) @ g.flatten(1)) ** 2 for g in gradients]).sum(0)
         slope2 = torch.where(inside.flatten(), slope2, slope2.new_zeros(()))
         slope = slope2.amax(dim=1).sqrt().view(query.wavelengths.numel(), -1).amax(dim=1)
-        return (slope * query.sensor_distance).cpu()
+        return rings + (slope * query.sensor_distance).cpu()
+
+
+def _ring_displacement(query: Query, share: float) -> float:
+    """Where the steepest ray of the symmetric path lands, or all but a share of what its rings scatter [m]."""
+    if query.scatter is None:
+        return 0.0
+    edges, outermost = query.panels, _outermost(query)
+    rho = edges[:-1, None] + edges.diff()[:, None] * torch.linspace(0, 1, 13).to(edges)
+    phase = radial_phase(query)(rho.flatten()).unflatten(-1, (-1, 13))
+    slope = (phase.diff() * (12 / edges.diff()[:, None])).abs().amax(dim=(1, 2)) / (2 * math.pi)
+    farthest = torch.maximum(slope, query.scatter.reach(share)).view(outermost.wavelengths.numel(), -1).amax(1)
+    return float(
+        (farthest.cpu() * outermost.wavelengths).max() * query.sensor_distance.cpu() / query.semi_aperture.cpu()
+    )
 
 
 # ---- propagation on a Cartesian pupil grid -----------------------------------------------------------------------

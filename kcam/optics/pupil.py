@@ -36,6 +36,7 @@ class Pupil:
     semi_aperture:    a [m], half the width of the aperture's bounding square; 0-d float64, may carry a gradient.
     sensor_distance:  d [m], likewise.
     paraxial:         True where the Fresnel approximation holds by definition of the model.
+    round:            True where no light passes beyond rho = 1.
     """
 
     x: Tensor
@@ -43,6 +44,7 @@ class Pupil:
     semi_aperture: Tensor
     sensor_distance: Tensor
     paraxial: bool
+    round: bool = False
 
     @property
     def rho2(self) -> Tensor:

@@ -59,7 +59,7 @@ def stated_error(
 ) -> float:
     query = lens.query([WAVELENGTH], distances=distance, pixel_pitch=pitch, shape=(n, n), integrate=False)
     row = choose(query, propagator=propagator)
-    return 3 * row.error(query) + row.model_error(query)
+    return 3 * (row.error(query) + row.model_error(query))
 
 
 def airy(points: np.ndarray) -> np.ndarray:

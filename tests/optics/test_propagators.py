@@ -50,7 +50,7 @@ def l1(psf: torch.Tensor | np.ndarray, truth: torch.Tensor | np.ndarray) -> floa
 
 def stated(row: Propagator, asked: Query) -> float:
     """What may separate a row from Rayleigh-Sommerfeld: three times its estimate, as promised, and the model's own."""
-    return 3 * row.error(asked) + row.model_error(asked)
+    return 3 * (row.error(asked) + row.model_error(asked))
 
 
 # ---- the table ---------------------------------------------------------------------------------------------------
