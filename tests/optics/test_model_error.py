@@ -114,7 +114,7 @@ def judge(seeds: range) -> list[float]:
         error, stated = case.error(), DEFAULT.model_error(case.query)
         print(f"{seed} {case.name}: {error:.1e}, stated {stated:.1e}")
         assert error <= 3 * max(stated, FLOOR), seed
-        assert stated <= 100 * max(error, FLOOR), seed
+        assert stated <= 40 * max(error, FLOOR), seed
         found.append(error / stated)
     return found
 
@@ -128,7 +128,7 @@ def test_the_stated_model_error_holds_over_random_lenses() -> None:
 def test_the_stated_model_error_holds_over_many_random_lenses(first: int) -> None:
     found = judge(range(first, first + 40))
     print(f"error over estimate: median {np.median(found):.2g}, from {min(found):.2g} to {max(found):.2g}")
-    assert np.median(found) >= 0.2
+    assert 0.5 <= np.median(found) <= 2
 
 
 def test_a_fast_lens_in_focus_is_not_wrong_and_a_slow_one_in_a_wide_window_is() -> None:
