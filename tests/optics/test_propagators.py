@@ -49,8 +49,8 @@ def l1(psf: torch.Tensor | np.ndarray, truth: torch.Tensor | np.ndarray) -> floa
 
 
 def stated(row: Propagator, asked: Query) -> float:
-    """What may separate a row from Rayleigh-Sommerfeld: three times its estimate, as promised, and the model's own."""
-    return 3 * (row.error(asked) + row.model_error(asked))
+    """What may separate a row from Rayleigh-Sommerfeld: three times its estimate and the model's, as promised."""
+    return 3 * (max(row.error(asked), 1e-6) + row.model_error(asked))  # down to the rounding of float32
 
 
 # ---- the table ---------------------------------------------------------------------------------------------------
