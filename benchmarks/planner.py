@@ -1,9 +1,10 @@
 """Whether plans keep their word: random pairs of camera and scene, planned at five tolerances and measured.
 
-    python -m benchmarks.planner [--pairs 300] [--start 0] [--out benchmarks/results/planner.json]
+    python -m benchmarks.planner [--pairs 300] [--hard 100] [--start 0] [--out benchmarks/results/planner.json]
 
 It goes on where it stopped: pairs that are in the file of partial results are not measured again. Each pair follows
-from its seed alone. A pair whose reference would take more than a minute is drawn again, and counted.
+from its seed alone. A pair whose reference would take more than a minute is drawn again, and counted. Hard pairs are
+those that a plan could overlook, `hard_pair`. An error is the worst of the whole batch and of each item in it.
 """
 
 from __future__ import annotations
@@ -134,6 +135,165 @@ def random_scene(draw: random.Random) -> tuple[Scene, str]:
     return replace(scene, depth=depth), f"{kind} {height} x {width}, {where} {near:.2g} to {far:.2g} m"
 
 
+# ---- hard pairs ----------------------------------------------------------------------------------------------------
+
+HARD_SIDES = (96, 192, 384, 560, 768)
+
+
+def hard_pair(seed: int, *, sides: tuple[int, ...] = HARD_SIDES) -> tuple[Camera, Scene, str, int]:
+    """As `random_pair`, of what a plan could overlook: lamps out of focus, batches with one item unlike the others,
+    saturation, depth edges in colour, hot pixels, wrapped radial profiles; the larger pictures with fewer items.
+    """
+    for attempt in range(100):
+        draw = random.Random(f"hard/{seed}/{attempt}")
+        camera, lens = hard_camera(draw)
+        scene, light = hard_scene(draw, sides)
+        if Planner(camera, scene).prices.of({})[0] <= LONGEST:
+            return camera, scene, f"{lens}; {light}", attempt
+    raise RuntimeError(f"seed {seed}: no pair within {LONGEST:g} s in 100 draws.")
+
+
+def hard_camera(draw: random.Random) -> tuple[Camera, str]:
+    """A lens of 50 mm that is open to 3 to 8 mm, with a wrapped radial profile now and then; a sensor."""
+    diameter, focus = draw.uniform(3, 8) * mm, 1 / draw.uniform(0.1, 1.5)
+    elements: list[optics.Element] = [optics.CircularAperture(diameter)]
+    ideal, radial = draw.random() < 0.5, draw.random() < 0.25
+    elements.append(optics.ThinLens(50 * mm) if ideal else optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"))
+    waves = draw.uniform(1, 8)
+    if radial:
+        profile = 2 * math.pi * waves * torch.linspace(0, 1, draw.choice([101, 201]), dtype=torch.float64)
+        elements.append(optics.RadialDOE(torch.remainder(profile, 2 * math.pi)))
+    stages, name = random_sensor(draw)
+    imaging = optics.Imaging(optics.Lens(*elements, focus_distance=focus), pixel_pitch=draw.choice([4, 6]) * um)
+    text = f"{diameter / mm:.2g} mm, focus {focus:.2g} m, {'ideal' if ideal else 'BK7'}"
+    text += f", wrapped radial profile of {waves:.2g} waves" if radial else ""
+    return Camera(imaging, *stages), f"{text}, {name}"
+
+
+def hard_scene(draw: random.Random, sides: tuple[int, ...] = HARD_SIDES) -> tuple[Scene, str]:
+    """Photographs of one exposure or many, with things in them of another distance and another light."""
+    kind = draw.choice(["lamps", "batch", "saturated", "colour edge", "hot pixels", "one bright tile"])
+    height, width = draw.choice(sides), draw.choice(sides)
+    generator = torch.Generator().manual_seed(draw.randrange(2**31))
+    batch = 1
+    if kind == "batch" or draw.random() < 0.2:
+        batch = draw.randint(2, 16)
+        height, width = (min(side, 96) for side in (height, width))
+    name = draw.choice(["astronaut", "coffee", "chelsea"])
+    planes = Scene.builtin(name, (height, width)).coefficients.repeat(batch, 1, 1, 1)
+    far = draw.uniform(0.1, 0.8)  # vergences
+    near = draw.uniform(far, 2.5)
+    flat = draw.random() < 0.2
+    vergence = torch.full((batch, 1, height, width), far, dtype=torch.float64)
+    rows, columns = torch.arange(float(height))[:, None], torch.arange(float(width))[None, :]
+    odd = draw.randrange(batch)
+
+    def disc() -> Tensor:
+        radius = draw.uniform(1, max(2, min(height, width) / 16))
+        place = draw.randrange(height), draw.randrange(width)
+        return torch.hypot(rows - place[0], columns - place[1]) <= radius
+
+    for item in range(batch):
+        planes[item] *= 10 ** draw.uniform(-1.5, 0.5)
+        if kind == "batch":
+            planes[item] = planes[item].roll((draw.randrange(height), draw.randrange(width)), (-2, -1))
+            vergence[item] = near if item == odd or draw.random() < 0.1 else far * draw.uniform(1, 1.05)
+        elif kind == "lamps":
+            for _ in range(draw.randint(1, 4)):
+                place = disc()
+                planes[item] = torch.where(place, planes[item] * 10 ** draw.uniform(0.5, 2) + 0.1, planes[item])
+                vergence[item] = torch.where(place, draw.uniform(far, near), vergence[item])
+        elif kind == "saturated":
+            planes[item] = planes[item] * 10 ** draw.uniform(0.5, 2)
+            share = torch.linspace(0, 1, width, dtype=torch.float64)
+            vergence[item] = (far + (near - far) * share).expand(height, width)
+        elif kind == "colour edge":
+            edge = columns > width * draw.uniform(0.2, 0.8) + height / 8 * torch.sin(rows / draw.uniform(5, 40))
+            colours = [torch.tensor([draw.random() ** 3 for _ in range(3)])[:, None, None] for _ in range(2)]
+            planes[item] = (0.2 + 0.8 * planes[item]) * torch.where(edge, colours[0], colours[1])
+            vergence[item] = torch.where(edge, near, far)
+        elif kind == "hot pixels":
+            planes[item] *= 0.1
+            for _ in range(draw.randint(1, 5)):
+                planes[item, :, draw.randrange(height), draw.randrange(width)] = 10 ** draw.uniform(0, 4)
+        else:
+            top, left = draw.randrange(max(1, height - 48)), draw.randrange(max(1, width - 48))
+            bright = planes[item, :, top : top + 48, left : left + 48].clone()
+            planes[item] *= 1e-3
+            planes[item, :, top : top + 48, left : left + 48] = bright
+            vergence[item, 0, top : top + 48, left : left + 48] = near
+    noise = 1 + 0.02 * torch.randn(planes.shape, generator=generator)
+    scene = Scene.builtin(name, (height, width))
+    depth = 1 / near if flat else 1 / vergence
+    scene = replace(scene, coefficients=(planes * noise).clamp(min=0), depth=depth)
+    where = f"at {1 / near:.2g} m" if flat else f"{1 / near:.2g} to {1 / far:.2g} m"
+    return scene, f"{kind} on {name} {batch} x {height} x {width}, {where}"
+
+
+LATER = (
+    ("moved", "exposed a little", "noisy", "mirrored", "alone"),
+    ("exposed", "photograph", "colours", "narrow band", "lamp", "contrast", "depth", "noise", "flat"),
+)
+"""What a camera may see after the scene that was planned for: much like it, or not."""
+
+
+def later_scene(draw: random.Random, scene: Scene) -> tuple[Scene, str]:
+    """Another scene that a camera with a plan for `scene` may meet, one of `LATER`."""
+    planes, depth = scene.coefficients.clone(), scene.depth
+    batch, count, height, width = planes.shape
+    kind = draw.choice(draw.choice(LATER))
+    if kind == "moved":
+        shift = draw.randint(-8, 8), draw.randint(-8, 8)
+        planes = planes.roll(shift, (-2, -1))
+        depth = depth.roll(shift, (-2, -1)) if isinstance(depth, Tensor) else depth
+    elif kind == "exposed a little":
+        planes *= draw.uniform(0.95, 1.05)
+    elif kind == "noisy":
+        planes *= 1 + 0.01 * torch.randn(planes.shape, generator=torch.Generator().manual_seed(draw.randrange(2**31)))
+        planes = planes.clamp(min=0)
+    elif kind == "mirrored":
+        planes, depth = planes.flip(-1), depth.flip(-1) if isinstance(depth, Tensor) else depth
+    elif kind == "alone":
+        item = draw.randrange(batch)
+        planes, depth = planes[item : item + 1], depth[item : item + 1] if isinstance(depth, Tensor) else depth
+    elif kind == "exposed":
+        planes *= 10 ** draw.uniform(-2, 1.5)
+    elif kind == "photograph" and count == 3:
+        name = draw.choice(["astronaut", "coffee", "chelsea", "motorcycle", "star", "point_grid"])
+        other = Scene.from_rgb(Scene.builtin(name, (height, width)).to_srgb(), depth=2.0).coefficients
+        planes = (other * 10 ** draw.uniform(-1, 0.3)).expand(batch, -1, -1, -1)
+    elif kind == "colours":
+        planes = (
+            planes[:, draw.sample(range(count), count)]
+            * torch.tensor([[[[draw.random()]], [[draw.random()]], [[draw.random()]]]])
+            if count == 3
+            else planes.flip(1)
+        )
+    elif kind == "narrow band" and scene.spectra is not None:
+        line = torch.zeros(len(scene.wavelengths))
+        line[draw.randrange(len(line))] = draw.uniform(1, 8)
+        spectra = scene.spectra.mean(0) * 0.02 + line
+        return Scene(
+            planes.mean(1, keepdim=True), spectra[None], scene.wavelengths, depth, scene.illuminant, scene.luminance
+        ), kind
+    elif kind == "lamp":
+        radius, row, column = draw.uniform(0.5, 6), draw.randrange(height), draw.randrange(width)
+        rows, columns = torch.arange(float(height))[:, None], torch.arange(float(width))[None, :]
+        place = torch.hypot(rows - row, columns - column) <= radius
+        planes = torch.where(place, planes + 10 ** draw.uniform(0, 3), planes)
+    elif kind == "contrast":
+        planes = planes ** draw.uniform(0.3, 4)
+    elif kind == "depth" and isinstance(depth, Tensor):
+        low, high = (1 / depth).aminmax()
+        share = torch.linspace(0, 1, height, dtype=torch.float64)[:, None].expand(batch, 1, height, width)
+        depth = 1 / (low + (high - low) * (share if draw.random() < 0.5 else (share > draw.random()).double()))
+    elif kind == "noise":
+        planes = torch.rand(planes.shape, generator=torch.Generator().manual_seed(draw.randrange(2**31)))
+    elif kind == "flat":
+        planes = planes.mean((-2, -1), keepdim=True).expand_as(planes).contiguous()
+    return replace(scene, coefficients=planes, depth=depth), kind
+
+
 def random_crop(scene: Scene, height: int, width: int, draw: random.Random) -> Scene:
     """A window of a scene."""
     _, h, w = scene.shape
@@ -155,9 +315,11 @@ def smooth_field(shape: tuple[int, int], *, scale: float | None, generator: torc
 # ---- the measurement -----------------------------------------------------------------------------------------------
 
 
-def measure_pair(seed: int, *, tolerances: tuple[float, ...] = TOLERANCES, rounds: int = 3) -> dict[str, Any]:
+def measure_pair(
+    seed: int, *, hard: bool = False, tolerances: tuple[float, ...] = TOLERANCES, rounds: int = 3
+) -> dict[str, Any]:
     """One pair: for each tolerance the estimate, the truth, and the times of the raw, by turns with the reference's."""
-    camera, scene, text, again = random_pair(seed)
+    camera, scene, text, again = hard_pair(seed) if hard else random_pair(seed)
     with torch.no_grad():
         planner = Planner(camera, scene)
         plans = [planner.plan(tolerance) for tolerance in tolerances]
@@ -176,7 +338,10 @@ def measure_pair(seed: int, *, tolerances: tuple[float, ...] = TOLERANCES, round
                 "tolerance": tolerance,
                 "bound": plan.bound,
                 "expected": plan.expected,
-                "error": relative_rms(shot[0][1], truth),
+                "error": max(
+                    relative_rms(a, b) for a, b in [(shot[0][1], truth), *zip(shot[0][1], truth, strict=True)]
+                ),
+                "checked": plan.checked,
                 "seconds": statistics.median(seconds for seconds, _ in shot),
                 "reference_seconds": statistics.median(references),
                 "predicted_seconds": plan.seconds,
@@ -185,7 +350,7 @@ def measure_pair(seed: int, *, tolerances: tuple[float, ...] = TOLERANCES, round
                 "changes": plan.changes,
             }
         )
-    return {"seed": seed, "pair": text, "drawn_again": again, "tolerances": rows}
+    return {"seed": f"hard {seed}" if hard else seed, "pair": text, "drawn_again": again, "tolerances": rows}
 
 
 def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -219,6 +384,7 @@ def main() -> None:
     """Measure what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pairs", type=int, default=300)
+    parser.add_argument("--hard", type=int, default=100)
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
@@ -227,20 +393,22 @@ def main() -> None:
     known = [json.loads(line) for line in partial.read_text().splitlines()] if partial.exists() else []
     done = {pair["seed"]: pair for pair in known}
     seeds = range(arguments.start, arguments.start + arguments.pairs)
-    for seed in seeds:
-        if seed not in done:
-            done[seed] = measure_pair(seed)
+    hard = [f"hard {seed}" for seed in range(arguments.start, arguments.start + arguments.hard)]
+    for key in [*seeds, *hard]:
+        if key not in done:
+            number = key if isinstance(key, int) else int(key.removeprefix("hard "))
+            done[key] = measure_pair(number, hard=isinstance(key, str))
             with partial.open("a") as file:
-                file.write(json.dumps(done[seed]) + "\n")
-            worst = max(row["error"] / row["tolerance"] for row in done[seed]["tolerances"])
-            third = done[seed]["tolerances"][2]
+                file.write(json.dumps(done[key]) + "\n")
+            worst = max(row["error"] / row["tolerance"] for row in done[key]["tolerances"])
+            third = done[key]["tolerances"][2]
             gain = third["reference_seconds"] / third["seconds"]
             text = f"worst {worst:.2f} of the tolerance; {gain:.1f} times as fast at 0.01"
-            print(f"{seed}: {done[seed]['pair']}: {text}", flush=True)
-    pairs = [done[seed] for seed in seeds]
+            print(f"{key}: {done[key]['pair']}: {text}", flush=True)
+    pairs, hard_pairs = ([done[key] for key in keys] for keys in (seeds, hard))
     failures = [
         {"seed": pair["seed"], "pair": pair["pair"], **row}
-        for pair in pairs
+        for pair in [*pairs, *hard_pairs]
         for row in pair["tolerances"]
         if row["error"] > row["tolerance"]
     ]
@@ -249,11 +417,13 @@ def main() -> None:
         "environment": measure.environment(),
         "summary": summary(pairs),
         "drawn_again": again,
+        "hard_summary": summary(hard_pairs) if hard_pairs else [],
         "failures": failures,
         "pairs": pairs,
+        "hard_pairs": hard_pairs,
     }
     measure.write_json(arguments.out, content)
-    for row in content["summary"]:
+    for row in [*content["summary"], *content["hard_summary"]]:
         print(row)
     print(f"{len(failures)} failures, {again} pairs drawn again")
 

@@ -327,6 +327,13 @@ def honesty_table() -> str:
         f"over a minute. Outside: {outside or 'none'}. Making the first plan of a pair took "
         f"{figures(content['summary'][0]['planning_share'])} times the reference's time in the median.",
     ]
+    if hard := content.get("hard_summary"):
+        inside = ", ".join(f"{row['inside']} of {row['pairs']} at {row['tolerance']:g}" for row in hard)
+        lines += [
+            "",
+            "Hard pairs (lamps out of focus, batches to 16, saturation, depth edges in colour, hot pixels, wrapped "
+            f"radial profiles, up to 768 pixels), each item of a batch by itself: inside are {inside}.",
+        ]
     return "\n".join(lines)
 
 

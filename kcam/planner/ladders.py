@@ -66,9 +66,14 @@ class Ladder:
         return self.levels[self.position]
 
     @property
+    def at_top(self) -> bool:
+        """Whether it is the reference physics."""
+        return self.position == len(self.levels) - 1
+
+    @property
     def error(self) -> float:
         """Estimated, of the rung that it stands on."""
-        return 0.0 if self.position == len(self.levels) - 1 else self.errors[self._key(self.position)]
+        return 0.0 if self.at_top else self.errors[self._key(self.position)]
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self.follows.position if self.follows else 0
@@ -76,7 +81,7 @@ class Ladder:
     def price(self, trials: Trials) -> None:
         """Estimate the error of the rung that it stands on."""
         key = self._key(self.position)
-        if self.position == len(self.levels) - 1 or key in self.errors:
+        if self.at_top or key in self.errors:
             return
         if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing
             self.errors[key] = 0.0

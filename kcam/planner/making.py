@@ -46,8 +46,9 @@ def make_plan(
     """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
 
     A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
-    until the sum of all errors is below the tolerance / `SAFETY`. The way up does not depend on the tolerance: with a
-    smaller one it goes further.
+    until the sum of all errors is below the tolerance / `SAFETY`, and on until the last trial is: the whole plan
+    against the reference, each item of each batch by itself. Beyond `trials.WITNESSED` pixels it sees only the worst of
+    them. The way up does not depend on the tolerance: with a smaller one it goes further.
 
     Args:      scenes: one or several, of the same wavelengths.
                tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this
@@ -74,6 +75,7 @@ class Planner:
         self.trials = Trials(camera, self.scenes)
         always = {} if max_memory is None else {"max_memory": float(max_memory)}
         self.prices = _Prices(camera, self.trials, self.scenes, always)
+        self._checked: dict[tuple[Any, ...], float] = {}
         self._known: tuple[list[Ladder], list[_Skip], Signals] | None = None
         self._setup = time.perf_counter() - start
 
@@ -83,17 +85,17 @@ class Planner:
         check_tolerance(tolerance)
         rows = _Rows(self.prices)
         skipped: list[int] = []
-        allowed = 0.0
+        allowed = checked = 0.0
         if tolerance != 0 and self.trials.samples:
             ladders, skips, signals = self._ways()
-            noise = max((self.trials.noise(given) for given in signals), default=0.0)
+            noise = self.trials.noise(signals)
             allowed = noise if isinstance(tolerance, str) else float(tolerance)
             if allowed == 0:  # a sensor without noise or steps records everything
                 ladders, skips = [], []
             movable: list[Any] = [*ladders, *skips]
             for choice in movable:
                 choice.position = 0
-            _climb(ladders, [skip for skip in skips if skip.counted], self.trials, allowed / SAFETY)
+            checked = self._settle(ladders, skips, allowed, noise if isinstance(tolerance, str) else None)
             skipped = _skipped(skips, allowed, noise if isinstance(tolerance, str) else None)
             for ladder in _relevant(ladders):
                 rows.add_ladder(ladder)
@@ -107,20 +109,42 @@ class Planner:
         return Plan(
             tolerance=tolerance,
             allowed=allowed,
-            bound=sum(errors),
+            bound=max(sum(errors), checked),
             expected=math.sqrt(sum(error**2 for error in errors)),
+            checked=checked,
             decisions=tuple(rows.decisions),
             changes=rows.changes,
             skipped=tuple(skipped),
             stages=tuple(type(stage).__name__ for stage in self.camera),
-            range=Range.of(self.scenes),
+            range=Range.of(self.scenes, [one for found in self.trials.surveys for one in found], self.trials.defocus),
             gradients=self.trials.gradients,
+            trained=tuple(name for name, p in self.camera.named_parameters() if p.requires_grad)
+            if self.trials.gradients
+            else (),
             seconds=rows.spent[0],
             memory=rows.spent[1],
             reference_seconds=reference[0],
             reference_memory=reference[1],
             planning_seconds=self._setup + time.perf_counter() - start,
         )
+
+    def _settle(self, steps: list[Ladder], skips: list[_Skip], allowed: float, noise: float | None) -> float:
+        """Climb until the estimates fit, and on until the last trial does; gives the error that it found."""
+        counted = [skip for skip in skips if skip.counted]
+        while True:
+            _climb(steps, counted, self.trials, allowed / SAFETY)
+            ways: list[Any] = [*_relevant(steps), *counted]
+            below = [way for way in ways if not way.at_top]
+            if not below:
+                return 0.0
+            changes = {key: value for ladder in _relevant(steps) for key, value in ladder.level.changes.items()}
+            skipped = tuple(_skipped(skips, allowed, noise))
+            key = tuple(sorted(changes.items())), skipped
+            if key not in self._checked:
+                self._checked[key] = self.trials.last(changes, skipped)
+            if self._checked[key] <= allowed / SAFETY:
+                return self._checked[key]
+            max(below, key=lambda way: way.error).climb(self.trials)
 
     def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
         """All choices, and what the stages of the sensor are given."""
@@ -218,6 +242,11 @@ class _Skip:
     def error(self) -> float:
         """Estimated, as it is now."""
         return 0.0 if self.position else self.error_if_skipped
+
+    @property
+    def at_top(self) -> bool:
+        """Whether it is kept."""
+        return self.position == 1
 
     def price(self, trials: Trials) -> None:
         """It is known."""

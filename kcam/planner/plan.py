@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import textwrap
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -19,6 +20,7 @@ from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context
 from kcam.optics import Imaging
 from kcam.plain import from_json
+from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Defocus, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
 
@@ -27,6 +29,16 @@ ENDS = (ADC, *DEMOSAICING)
 
 SAFETY = 1.25
 """The sum of a plan's errors stays below the tolerance by this factor: what pricing each choice by itself misses."""
+
+
+GROWTH = 4.0
+"""Times the error of the last trial, up to which a later scene's is foretold."""
+
+LEAST, COLOUR, DEPTH, OTHER_LIGHT = 1e-6, 0.01, 0.1, 1.5
+"""Potentials, and shares of bands and distances, beside which smaller ones do not count; how far those may differ."""
+
+WAYS = {"direct", "tile", "max_memory"}
+"""Changes of an Imaging that have one result."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +64,11 @@ class Decision:
 class Range:
     """What the scenes of a plan were like: outside of it the plan's errors are not known.
 
-    farthest, nearest: vergences [1/m]. contrast: RMS of the differences between neighbouring pixels, relative to the
-    RMS of the pixels. wavelengths [m].
+    farthest, nearest: vergences [1/m]. wavelengths [m]. Of a plan that was saved before they were kept the rest is
+    empty, and not asked for: contrast: RMS between neighbouring pixels, relative to what is recorded. potential: of
+    the `KINDS` of what a choice could hurt, the most, relative likewise. light, depths: the largest share of each band
+    and of each range of defocus. saturated: the least light beyond what is recorded, relative likewise. darkest,
+    brightest: RMS of what is recorded [share of the full well]. defocus: how the lens blurred.
     """
 
     height: int
@@ -62,27 +77,67 @@ class Range:
     nearest: float
     contrast: float
     wavelengths: tuple[float, ...]
+    potential: tuple[float, ...] = ()
+    light: tuple[float, ...] = ()
+    depths: tuple[float, ...] = ()
+    saturated: float = 0.0
+    darkest: float = 0.0
+    brightest: float = 0.0
+    defocus: Defocus | None = None
 
     @classmethod
-    def of(cls, scenes: Sequence[Scene]) -> Range:
-        """The range that scenes span."""
-        ends, contrasts = [], []
+    def of(cls, scenes: Sequence[Scene], surveys: Sequence[Survey], defocus: Defocus) -> Range:
+        """The range that scenes span, by what was found in each item of their batches."""
+        ends = []
         for scene in scenes:
             depth = torch.as_tensor(scene.depth, dtype=torch.float64).detach()
             ends += [] if depth.numel() == 0 else [1 / float(depth.max()), 1 / float(depth.min())]
-            contrasts.append(_contrast(scene))
+        nothing = torch.zeros(1, len(KINDS), dtype=torch.float64), torch.zeros(1, len(scenes[0].wavelengths))
+        potential = torch.stack([found.relative() for found in surveys]) if surveys else nothing[0]
+        light = torch.stack([found.light for found in surveys]) if surveys else nothing[1]
+        depths = torch.stack([found.depths for found in surveys]) if surveys else torch.zeros(1, 1)
         return cls(
             height=max(scene.shape[1] for scene in scenes),
             width=max(scene.shape[2] for scene in scenes),
             farthest=min(ends, default=0.0),
             nearest=max(ends, default=0.0),
-            contrast=max(contrasts),
+            contrast=math.sqrt(float(potential[:, NEIGHBOURS].max())),
             wavelengths=tuple(scenes[0].wavelengths.tolist()),
+            potential=tuple(potential.amax(0).tolist()),
+            light=tuple(_shares(light).amax(0).tolist()),
+            depths=tuple(_shares(depths).amax(0).tolist()),
+            saturated=float(potential[:, -1].min()),
+            darkest=min((found.level for found in surveys), default=0.0),
+            brightest=max((found.level for found in surveys), default=0.0),
+            defocus=defocus,
         )
 
+    def growth(self, found: Survey, changes: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+        """How many times as large the error of changes could be in a scene, for each kind of reason, in words.
+
+        What differs between wavelengths and distances is foretold to the power of 2: in one scene errors cancel, or lie
+        in the dark, that add up in another.
+        """
+        depth, relative = bool({"layers", "occlusion"} & set(changes)), found.relative().tolist()
+        hidden = max(1.0, math.sqrt((1 + self.saturated) / (1 + relative[-1])))  # errors, by the full well
+        for kind, ours, planned in zip(KINDS, relative, self.potential, strict=True):
+            if depth or kind not in OF_DEPTH:
+                yield kind, hidden * math.sqrt((ours + LEAST) / (planned + LEAST))
+        if depth:
+            share, known = _shares(found.depths), torch.tensor(self.depths).to(found.depths)
+            yield "light at some distances", float(((share + DEPTH) / (known + DEPTH)).max()) ** 2 / OTHER_LIGHT
+        light, known = _shares(found.light), torch.tensor(self.light).to(found.light)
+        ratios = (light + COLOUR) / (known + COLOUR)
+        band = int(ratios.argmax())
+        yield f"share of light at {self.wavelengths[band] * 1e9:.0f} nm", float(ratios[band]) ** 2 / OTHER_LIGHT
+        if "bands" in changes and bool(light.any()):
+            order = torch.tensor(self.wavelengths).argsort()
+            uneven = [_unevenness(one[order], int(changes["bands"])) + COLOUR for one in (light, known)]
+            yield "differences of light between wavelengths that share a PSF", (uneven[0] / uneven[1]) ** 2
+
     def leaves(self, scene: Scene) -> str | None:
-        """In what a scene lies outside, or None; a tenth of the depth and a quarter of the contrast are let pass."""
-        other = Range.of([scene])
+        """In what a scene's geometry lies outside, or None; a tenth of the depth is let pass."""
+        other = Range.of([scene], [], Defocus.none())
         slack = 0.1 * (self.nearest - self.farthest) + 1e-9
         if other.wavelengths != self.wavelengths:
             return f"has other wavelengths ({len(other.wavelengths)}) than were planned for ({len(self.wavelengths)})"
@@ -92,8 +147,6 @@ class Range:
             return f"goes out to {_metres(other.farthest)}; the farthest planned for was {_metres(self.farthest)}"
         if other.height * other.width > 1.2 * self.height * self.width:
             return f"has {other.height} x {other.width} pixels; the plan was for {self.height} x {self.width}"
-        if other.contrast > 1.25 * self.contrast:
-            return f"has {other.contrast / self.contrast:.3g} times the contrast between neighbours planned for"
         return None
 
 
@@ -102,9 +155,11 @@ class Plan:
     """What to simulate of a camera for a scene, as a value: print it, change it, save it, apply it.
 
     tolerance: as asked for; allowed: the number that it stands for.
-    bound: sum of the counted errors, at most allowed / `SAFETY`. expected: root of the sum of their squares.
+    bound: sum of the counted errors, or what the last trial found if that is more; at most allowed / `SAFETY`.
+    expected: root of the sum of their squares. checked: what the last trial found; None if there was none.
     changes: arguments of the camera's Imaging. skipped: indices of the stages that are left out.
-    stages: classes of the camera's, by which it is known again. gradients: whether they were held to the tolerance.
+    stages: classes of the camera's, by which it is known again. gradients: whether they were held to the tolerance, and
+    trained: of which parameters; None where that was not kept.
     seconds, memory: predicted for the raw; reference_seconds, reference_memory: of the camera without the plan.
     planning_seconds: what making the plan took. measured: what `measure` found, beside what was predicted.
     """
@@ -125,6 +180,8 @@ class Plan:
     reference_memory: float
     planning_seconds: float
     measured: dict[str, float] = field(default_factory=dict)
+    checked: float | None = None
+    trained: tuple[str, ...] | None = None
 
     def apply(self, camera: Camera) -> Camera:
         """The camera with only the chosen physics; it shares all parameters, and warns of scenes out of range.
@@ -139,17 +196,49 @@ class Plan:
             )
         if not self.changes and not self.skipped:
             return camera
-        stages: list[nn.Module] = []
-        for index, stage in enumerate(camera):
-            kept: Any = stage
-            if isinstance(stage, Imaging) and self.changes:
-                kept = stage.changed(**self.changes)
-            elif index in self.skipped:
-                bypass: Any = getattr(stage, "bypass", None)
-                kept = bypass() if callable(bypass) else None
-            if kept is not None:
-                stages.append(kept)
-        return PlannedCamera(*stages, context=camera.resolve(), plan=self)
+        stages = shortened(camera, self.changes, self.skipped)
+        known = self.trained if self.gradients else ()
+        ahead = noiseless_raw(camera)
+        unplanned = (
+            []
+            if known is None
+            else [
+                p
+                for name, p in camera.named_parameters()
+                if name not in known and any(p is q for q in ahead.parameters())
+            ]
+        )
+        return PlannedCamera(*stages, context=stages.context, plan=self, unplanned=unplanned)
+
+    def outside(self, camera: Camera, scene: Scene) -> str | None:
+        """In what a scene is unlike those that were planned for, such that the error may exceed the tolerance; or None.
+
+        By gain x potential: an error grows with the root of the potentials that a scene has more of, and noise that is
+        left out as there is less light. What grows beyond what the last trial left of the tolerance, or `GROWTH` times,
+        is outside.
+        """
+        geometry, window = self.range.leaves(scene), self.changes.get("psf_shape", (1, 1))
+        for own, planned, side in zip(scene.shape[1:], (self.range.height, self.range.width), window, strict=True):
+            if side < max(window) and own > planned:  # the window was only as large as the picture
+                geometry = f"is {own} pixels across where the plan was for {planned}, of which it needs more"
+        if geometry or not self.range.potential or self.range.defocus is None:
+            return geometry
+        error = self.bound if self.checked is None else self.checked
+        hidden = [row.error for row in self.decisions if row.chosen == "left out" and not row.counted]
+        noise = math.sqrt(sum(value**2 for value in hidden))
+        for found in survey(scene, camera, self.range.defocus):
+            if noise * self.range.darkest > self.allowed * found.level:
+                return f"has {self.range.darkest / max(found.level, 1e-30):.3g} times less light, and noise is left out"
+            allowed = self.allowed
+            if isinstance(self.tolerance, str):  # less noise in more light
+                allowed *= min(1.0, self.range.brightest / max(found.level, 1e-30))
+            if set(self.changes) <= WAYS and not error:
+                continue
+            most = min(GROWTH, allowed / max(error, 1e-30))
+            for kind, growth in self.range.growth(found, self.changes):
+                if growth > most:
+                    return f"has {growth:.3g} times the {kind} planned for, where {most:.3g} times is safe"
+        return None
 
     def measure(self, camera: Camera, scene: Scene, *, truth: Tensor | None = None) -> float:
         """True error of the plan: relative RMS of its noiseless raw against that of the camera without it (`truth`)."""
@@ -194,26 +283,50 @@ def _read(text: str | bytes, wrong: str) -> Plan:
 
 
 class OutOfRange(UserWarning):
-    """A scene is outside of what a plan was made for."""
+    """A scene, or a gradient, is outside of what a plan was made for."""
 
 
 class PlannedCamera(Camera):
-    """A camera with a plan applied: it warns (`OutOfRange`) where a scene leaves the range that was planned for."""
+    """A camera with a plan applied: it warns (`OutOfRange`) where a scene leaves the range that was planned for, and
+    where gradients flow that were not planned for.
 
-    def __init__(self, *stages: nn.Module, plan: Plan, context: Context | None = None) -> None:
+    unplanned: parameters through whose gradients the plan's shortcuts act, and that it does not know.
+    """
+
+    def __init__(
+        self, *stages: nn.Module, plan: Plan, context: Context | None = None, unplanned: Sequence[nn.Parameter] = ()
+    ) -> None:
         super().__init__(*stages, context=context)
-        self.plan_applied = plan
+        self.plan_applied, self.unplanned = plan, tuple(unplanned)
 
     def steps(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Iterator[tuple[str, Tensor]]:
         """As `Camera.steps`."""
-        outside = self.plan_applied.range.leaves(scene) if isinstance(scene, Scene) else None
+        plan = self.plan_applied
+        outside = plan.outside(self, scene) if isinstance(scene, Scene) else None
         if outside:
             warnings.warn(
-                f"the scene {outside}: the error may exceed the tolerance of {self.plan_applied.allowed:g}. Plan for "
-                "such scenes too: camera.plan([scene, ...], tolerance=...).",
+                f"the scene {outside}: the error may exceed the tolerance of {plan.allowed:g}. Plan for such scenes "
+                "too: camera.plan([scene, ...], tolerance=...).",
                 OutOfRange,
                 stacklevel=3,
             )
+        if torch.is_grad_enabled():
+            flows = [p for p in self.unplanned if p.requires_grad]
+            towards = [
+                name
+                for name in ("coefficients", "depth", "spectra")
+                if isinstance(value := getattr(scene, name, None), Tensor) and value.requires_grad
+            ]
+            if flows or towards:
+                what = f"{len(flows)} parameter{'s' * (len(flows) > 1)}" if flows else f"the scene's {towards[0]}"
+                fix = "with autograd on: plan = camera.plan(scene, tolerance=...) outside torch.no_grad()"
+                fix = f"Make it {fix}" if flows else "Use the camera without a plan"
+                warnings.warn(
+                    f"gradients flow to {what} through a plan that was not made for them, and may be wrong by any "
+                    f"amount. {fix}, or take the picture under torch.no_grad().",
+                    OutOfRange,
+                    stacklevel=3,
+                )
         return super().steps(scene, generator=generator)
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -234,6 +347,21 @@ def with_imaging(camera: Camera, **arguments: Any) -> Camera:
     return Camera(*stages, context=camera.context)
 
 
+def shortened(camera: Camera, changes: Mapping[str, Any], skipped: Sequence[int]) -> Camera:
+    """The camera with arguments of its Imaging changed, and without some stages; all else is shared."""
+    stages: list[nn.Module] = []
+    for index, stage in enumerate(camera):
+        kept: Any = stage
+        if isinstance(stage, Imaging) and changes:
+            kept = stage.changed(**changes)
+        elif index in skipped:
+            bypass: Any = getattr(stage, "bypass", None)
+            kept = bypass() if callable(bypass) else None
+        if kept is not None:
+            stages.append(kept)
+    return Camera(*stages, context=camera.resolve())
+
+
 def relative_rms(a: Tensor, b: Tensor) -> float:
     """sqrt(mean (a - b)^2 / mean b^2): 0 for two black pictures, and without a bound for one."""
     a, b = a.detach().double(), b.detach().double()
@@ -242,12 +370,15 @@ def relative_rms(a: Tensor, b: Tensor) -> float:
     return float((a - b).square().mean().sqrt() / b.square().mean().sqrt().clamp(min=1e-30))
 
 
-def _contrast(scene: Scene) -> float:
-    planes = scene.coefficients.detach().float()
-    if not planes.numel():
-        return 0.0
-    steps = sum(float(planes.diff(dim=dim).square().sum()) for dim in (-2, -1))
-    return (steps / max(float(planes.square().sum()), 1e-30)) ** 0.5
+def _shares(values: Tensor) -> Tensor:
+    """Of the root of the sum of squares."""
+    return values / values.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+
+
+def _unevenness(light: Tensor, groups: int) -> float:
+    """RMS of the differences between bands and the mean of their group, relative to that of all."""
+    apart = torch.cat([group - group.mean() for group in light.tensor_split(groups)])
+    return float(apart.norm() / light.norm().clamp(min=1e-30))
 
 
 # ---- the table -----------------------------------------------------------------------------------------------------
@@ -279,6 +410,8 @@ def _summary(plan: Plan) -> list[str]:
         f"Error of the noiseless raw: at most {plan.bound:.2g}, {plan.expected:.2g} expected (allowed "
         f"{plan.allowed:.3g}; in brackets: noise and rounding, outside the sum)."
     )
+    if plan.checked is not None:
+        text += f" The last trial found {plan.checked:.2g}."
     if plan.reference_seconds > 0:
         share = plan.planning_seconds / plan.reference_seconds
         text += (

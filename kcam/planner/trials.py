@@ -5,13 +5,18 @@
 is what replacing the transfer functions H by G changes. By Parseval it is the energy of a picture, and is computed as
 one: amplitudes added over wavelengths before squaring, inside the camera's own borders, mosaic, layers and full well,
 so that none of the caveats of a formula in radial averages applies (numerics note, section 11). It is cheap because a
-choice is tried beside others that are cheap: few wavelengths, few layers of depth.
+choice is tried beside others that are cheap: few wavelengths, few layers of depth. Where it is tried follows from a
+`survey`: the items and tiles where a choice could hurt most, and what share of the picture they stand for.
+
+The last trial is of the whole plan against the reference, on all that was planned for, or on the worst `WITNESSED`
+pixels of it.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,26 +27,28 @@ from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import Imaging
-from kcam.planner.plan import ENDS, noiseless_raw, relative_rms, with_imaging
+from kcam.planner.plan import ENDS, noiseless_raw, relative_rms, shortened, with_imaging
+from kcam.planner.survey import KINDS, TILE, Defocus, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
 from kcam.sensor.noise import RandomStage
 
-LARGEST = 320**2  # pixels of a scene that is tried whole
-CROP, CROPS = 160, 3  # else: side of the crops [pixels], and how many
-MOST = 4  # scenes of a batch
+LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
+CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
+WITNESSED = 2**20  # pixels of the last trial
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A scene to try choices on, or a crop of one.
+    """Scenes to try choices on, or crops of them, as one batch: of the nearest and the farthest point too, so that
+    layers of depth lie where they lie in the whole.
 
-    origin: which scene it is of. depth_share: of that scene's range of vergence, that the crop has.
+    owners: whose each row is. factors: on their relative errors, for the part of a scene that its crops stand for.
     """
 
     scene: Scene
-    origin: int
-    depth_share: float = 1.0
+    owners: tuple[int, ...]
+    factors: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -67,24 +74,25 @@ class Trials:
         self.imaging: Imaging | None = None if self.index is None else stages[self.index]
         self.parameters = [p for p in self.raw_camera.parameters() if p.requires_grad]
         self.gradients = torch.is_grad_enabled() and bool(self.parameters)
-        items = [item for scene in scenes for item in _items(scene) if item.coefficients.numel()]
-        self.samples = [sample for origin, item in enumerate(items) for sample in _samples(item, origin)]
+        self.defocus = Defocus.none() if self.imaging is None else Defocus.of(self.imaging, scenes[0].wavelengths)
+        full = [scene for scene in scenes if scene.coefficients.numel()]
+        self.surveys = [survey(scene, self.raw_camera, self.defocus) for scene in full]
+        self.samples = _samples(full, self.surveys, pixels=LARGEST, side=CROP)
+        self.witnesses = _samples(full, self.surveys, pixels=WITNESSED)
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
 
     def error(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes.
+        """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes."""
+        return _error(self.samples, self.answers(changes), self.answers(against))
 
-        The crops of one scene are one picture: their squares add up.
-        """
-        worst = 0.0
-        ours, theirs = self.answers(changes), self.answers(against)
-        for origin in {sample.origin for sample in self.samples}:
-            of = [index for index, sample in enumerate(self.samples) if sample.origin == origin]
-            pairs = [(join([ours[i].raw for i in of]), join([theirs[i].raw for i in of]))]
-            for k in range(len(ours[of[0]].gradients)):
-                pairs.append((sum_of(ours[i].gradients[k] for i in of), sum_of(theirs[i].gradients[k] for i in of)))
-            worst = max(worst, *(relative_rms(a, b) for a, b in pairs if bool(b.any())), 0.0)
-        return worst
+    def last(self, changes: Mapping[str, Any], skipped: Sequence[int]) -> float:
+        """True error of a finished plan on all that it is for, or on the worst of it: the worst over the scenes."""
+        ours = [self._answer(sample, changes, skipped) for sample in self.witnesses]
+        return _error(self.witnesses, ours, self._references)
+
+    @functools.cached_property
+    def _references(self) -> list[Answer]:
+        return [self._answer(sample, {}) for sample in self.witnesses]
 
     def answers(self, changes: Mapping[str, Any]) -> list[Answer]:
         """The raw of every sample under changes of the Imaging."""
@@ -93,27 +101,22 @@ class Trials:
             self._answers[key] = [self._answer(sample, changes) for sample in self.samples]
         return self._answers[key]
 
-    def _answer(self, sample: Sample, changes: Mapping[str, Any]) -> Answer:
+    def _answer(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Answer:
+        camera = self._with(changes, skipped)
         with torch.set_grad_enabled(self.gradients):
-            raw = self._shoot(sample, changes)
+            raw = camera(sample.scene)
             if not self.gradients or not raw.requires_grad:
                 return Answer(raw.detach(), tuple(torch.zeros_like(p) for p in self.parameters if self.gradients))
             with torch.no_grad():
-                sharp = self._shoot(sample, {"blur": False})
+                sharp = self._with({"blur": False})(sample.scene)
             loss = (raw - sharp).square().mean() / 2
             found = torch.autograd.grad(loss, self.parameters, allow_unused=True)
         pairs = zip(found, self.parameters, strict=True)
         return Answer(raw.detach(), tuple(torch.zeros_like(p) if g is None else g for g, p in pairs))
 
-    def _shoot(self, sample: Sample, changes: Mapping[str, Any]) -> Tensor:
-        return self._with(sample, changes)(sample.scene)
-
-    def _with(self, sample: Sample, changes: Mapping[str, Any]) -> Camera:
-        if self.imaging is None:
-            return self.raw_camera
-        changes = dict(changes)
-        if changes.get("layers", 1) > 1:  # of the whole scene's range: as far apart in the sample's
-            changes["layers"] = 1 + math.ceil((changes["layers"] - 1) * sample.depth_share)
+    def _with(self, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Camera:
+        if skipped:
+            return noiseless_raw(shortened(self.camera, changes, skipped))
         return with_imaging(self.raw_camera, **changes)
 
     # ---- the stages of the sensor --------------------------------------------------------------------------------
@@ -130,11 +133,11 @@ class Trials:
         return found
 
     def signals(self, settings: Mapping[str, Any]) -> list[dict[int, tuple[Tensor, Context]]]:
-        """For each sample: what every stage up to the ADC is given, without noise, with these optics."""
+        """For each row of the samples: what every stage up to the ADC is given, without noise, with these optics."""
         result = []
         with torch.no_grad():
             for sample in self.samples:
-                camera = self._with(sample, settings)
+                camera = self._with(settings)
                 context = self.camera.resolve(sample.scene)
                 given: dict[int, tuple[Tensor, Context]] = {}
                 if self.index != 0:
@@ -143,69 +146,127 @@ class Trials:
                 for name, signal in camera.steps(sample.scene):
                     index += 1 + name.count(" + ")  # an Imaging that absorbs its filter is one step
                     given[index] = (signal, context)
-                result.append(given)
+                result += [
+                    {index: (signal[row : row + 1], told) for index, (signal, told) in given.items()}
+                    for row in range(len(sample.owners))
+                ]
         return result
 
-    def noise(self, given: Mapping[int, tuple[Tensor, Context]]) -> float:
-        """Of one sample: sigma of all noise and half a step of the ADC, relative to the raw's RMS."""
-        total = 0.0
+    def noise(self, signals: Sequence[Mapping[int, tuple[Tensor, Context]]]) -> float:
+        """Sigma of all noise and half a step of the ADC, relative to the raw's RMS: of the scene that has least."""
+        found: dict[int, list[float]] = {}
         for index, stage in enumerate(self.camera):
-            if isinstance(stage, RandomStage) and index in given:
-                total += stage.error_if_skipped(*given[index]) ** 2
-            if isinstance(stage, ADC) and index in given:
-                total += 3 * stage.error_if_skipped(*given[index]) ** 2  # half a step is sqrt(3) of its sigma
+            share = 3 if isinstance(stage, ADC) else 1  # half a step is sqrt(3) of its sigma
+            if isinstance(stage, (RandomStage, ADC)):
+                energies: dict[int, list[float]] = {}
+                for owner, given in zip((o for sample in self.samples for o in sample.owners), signals, strict=True):
+                    energy = float(given[index][0].detach().double().square().sum())
+                    part = energies.setdefault(owner, [0.0, 0.0])
+                    part[0] += share * energy * stage.error_if_skipped(*given[index]) ** 2
+                    part[1] += energy
+                for owner, (noise, energy) in energies.items():
+                    found.setdefault(owner, []).append(noise / max(energy, 1e-30))
             if isinstance(stage, ENDS):
                 break
-        return math.sqrt(total)
+        return min((math.sqrt(sum(parts)) for parts in found.values()), default=0.0)
 
 
-def join(pictures: Sequence[Tensor]) -> Tensor:
-    """Pictures as one row of numbers."""
-    return torch.cat([picture.flatten() for picture in pictures])
+def _error(samples: Sequence[Sample], ours: Sequence[Answer], theirs: Sequence[Answer]) -> float:
+    """Relative RMS of raws, the worst over the scenes, and of gradients, over the batches.
+
+    The crops of one scene are one picture: their squares add up.
+    """
+    found = [0.0]
+    for sample, one, other in zip(samples, ours, theirs, strict=True):
+        for owner, factor in dict(zip(sample.owners, sample.factors, strict=True)).items():
+            rows = [row for row, whose in enumerate(sample.owners) if whose == owner]
+            if bool(other.raw[rows].any()):
+                found.append(factor * relative_rms(one.raw[rows], other.raw[rows]))
+        found += [relative_rms(a, b) for a, b in zip(one.gradients, other.gradients, strict=True) if bool(b.any())]
+    return max(found)
 
 
-def sum_of(tensors: Iterable[Tensor]) -> Tensor:
-    """Sum of tensors."""
-    return torch.stack(list(tensors)).sum(0)
+def _samples(
+    scenes: Sequence[Scene], surveys: Sequence[Sequence[Survey]], *, pixels: int, side: int | None = None
+) -> list[Sample]:
+    """What choices are tried on: all that there is while it has not more than so many pixels; else the scenes with the
+    largest potential of each kind, relative to what is recorded of them, and others as they come closest to those.
+
+    side: of the crops that are made of a single scene with more than so many pixels; None: so that they have as many.
+    """
+    every = [(index, row) for index, found in enumerate(surveys) for row in range(len(found))]
+    if not every:
+        return []
+    relative = torch.stack([surveys[index][row].relative() for index, row in every])
+    score = (relative / relative.amax(0).clamp(min=1e-30)).amax(1)
+    sizes = [scenes[index].shape[1] * scenes[index].shape[2] for index, _ in every]
+    chosen = list(dict.fromkeys(relative.argmax(0).tolist()))
+    for other in score.argsort(descending=True, stable=True).tolist():
+        if other not in chosen and sum(sizes[k] for k in chosen) + sizes[other] <= pixels:
+            chosen.append(other)
+    if side is None:
+        pixels //= len(chosen)
+        side = int((pixels / (len(KINDS) + 2)) ** 0.5)
+    samples = []
+    for index, (scene, found) in enumerate(zip(scenes, surveys, strict=True)):
+        rows = {row for owner, (of, row) in enumerate(every) if of == index and owner in chosen}
+        if rows:
+            ends = [min(range(len(found)), key=lambda row: found[row].far.min().item())]
+            ends += [max(range(len(found)), key=lambda row: found[row].near.max().item())]
+            rows |= set(ends) if found[ends[0]].far.min() < found[ends[1]].near.max() else set()
+            first = every.index((index, 0))
+            samples.append(_sample(scene, found, sorted(rows), first=first, side=side, pixels=pixels))
+    return samples
 
 
-def _items(scene: Scene) -> list[Scene]:
-    """The scenes of a batch, or some of a large one."""
-    batch = scene.shape[0]
-    chosen = range(batch) if batch <= MOST else sorted({round(i * (batch - 1) / (MOST - 1)) for i in range(MOST)})
-    items = []
-    for index in chosen:
-        depth = scene.depth[index : index + 1] if isinstance(scene.depth, Tensor) else scene.depth
-        items.append(replace(scene, coefficients=scene.coefficients[index : index + 1], depth=depth))
-    return items
+def _sample(
+    scene: Scene, surveys: Sequence[Survey], rows: Sequence[int], *, first: int, side: int, pixels: int
+) -> Sample:
+    """Some scenes of a batch, whole or in crops: of each the tile with the largest potential of each kind, with what
+    its blur reaches, and the tiles of the farthest and the nearest point.
 
-
-def _samples(scene: Scene, origin: int) -> list[Sample]:
-    """A small scene whole; of a large one, crops: the most detailed of each of some strata of detail."""
-    if scene.shape[1] * scene.shape[2] <= LARGEST:
-        return [Sample(scene, origin)]
-    return _crops(scene, origin)
-
-
-def _crops(scene: Scene, origin: int) -> list[Sample]:
+    By gain x potential the error of the crops stands for that of the scene, relative to what is recorded of it.
+    """
     _, height, width = scene.shape
-    size = (min(CROP, height), min(CROP, width))
-    found: list[tuple[float, int, Scene]] = []
-    for row in range(math.ceil(height / size[0])):
-        for column in range(math.ceil(width / size[1])):
-            top, left = min(row * size[0], height - size[0]), min(column * size[1], width - size[1])
-            crop = scene.crop(top=top, left=left, height=size[0], width=size[1])
-            planes = crop.coefficients.detach()
-            detail = sum(float(planes.diff(dim=dim).square().mean()) for dim in (-2, -1))
-            found.append((detail / max(float(planes.square().mean()), 1e-30), len(found), crop))
-    found.sort(key=lambda item: item[:2], reverse=True)
-    strata = [found[len(found) * index // CROPS] for index in range(min(CROPS, len(found)))]
-    whole = _vergence_range(scene)
-    return [Sample(crop, origin, _vergence_range(crop) / whole if whole else 1.0) for _, _, crop in strata]
+    crops: list[tuple[int, int, int]] = []
+    factors = {}
+    blur = max(float(surveys[row].blur.max()) for row in rows)
+    extent = side + 2 * math.ceil(blur)
+    for row in rows:
+        found = surveys[row]
+        ends = [1e9 - found.far, found.near] if float(found.near.max()) > float(found.far.min()) else []
+        kinds = [*found.potential, found.recorded]
+        seen = torch.zeros_like(found.recorded, dtype=torch.bool)
+        for kind in [*kinds, *ends]:
+            tile = divmod(int(kind.argmax()), kind.shape[1])
+            if not seen.any() or (bool(kind.any()) and not bool(seen[tile])):
+                top, of_rows = _window(tile[0], len(kind), extent, height)
+                left, of_columns = _window(tile[1], kind.shape[1], extent, width)
+                seen |= of_rows[:, None] & of_columns
+                crops.append((row, top, left))
+        shares = [float(kind[seen].sum() / kind.sum()) for kind in kinds if kind.any()]
+        factors[row] = math.sqrt(shares[-1] / min(shares)) if shares else 1.0
+    size = {"height": min(extent, height), "width": min(extent, width)}
+    if height * width <= pixels or len(rows) * height * width <= len(crops) * size["height"] * size["width"]:
+        part = [_rows(scene, [row]) for row in rows]
+        crops, factors = [(row, 0, 0) for row in rows], dict.fromkeys(rows, 1.0)
+    else:
+        part = [_rows(scene, [row]).crop(top=top, left=left, **size) for row, top, left in crops]
+    maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
+    depth = torch.cat(maps) if maps else scene.depth
+    together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
+    owners = tuple(first + row for row, _, _ in crops)
+    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops))
 
 
-def _vergence_range(scene: Scene) -> float:
-    if not isinstance(scene.depth, Tensor) or not scene.depth.numel():
-        return 0.0
-    vergence = 1 / scene.depth.detach().double()
-    return float(vergence.max() - vergence.min())
+def _rows(scene: Scene, rows: list[int]) -> Scene:
+    depth = scene.depth[rows] if isinstance(scene.depth, Tensor) else scene.depth
+    return replace(scene, coefficients=scene.coefficients[rows], depth=depth)
+
+
+def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:
+    """Where a window around a tile starts along one side of a picture, and which tiles have their centre in it."""
+    extent = min(extent, length)
+    start = min(max(0, tile * TILE + (TILE - extent) // 2), length - extent)
+    centres = (torch.arange(count) * TILE + TILE // 2).clamp(max=length - 1)
+    return start, (centres >= start) & (centres < start + extent)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import random
 import statistics
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import pytest
@@ -15,9 +16,9 @@ import torch
 from torch import Tensor, nn
 
 import kcam
-from benchmarks.planner import TOLERANCES, random_pair
+from benchmarks.planner import LATER, TOLERANCES, hard_pair, later_scene, random_pair
 from kcam import Camera, Scene, isp, optics, sensor
-from kcam.planner import OutOfRange, Plan, Planner, noiseless_raw, relative_rms
+from kcam.planner import OutOfRange, Plan, Planner, noiseless_raw, relative_rms, trials
 from kcam.planner.ladders import even_counts
 from kcam.units import mm, um, wavelength_grid
 
@@ -122,6 +123,107 @@ def test_large_scenes_are_planned_on_crops() -> None:
     assert sum(math.prod(sample.scene.shape[1:]) for sample in planner.trials.samples) < 400 * 400 / 2
 
 
+def item_of(scene: Scene, row: int) -> Scene:
+    depth = scene.depth[row : row + 1] if isinstance(scene.depth, Tensor) else scene.depth
+    return dataclasses.replace(scene, coefficients=scene.coefficients[row : row + 1], depth=depth)
+
+
+def assert_inside(shot: Camera, light: Scene, tolerances: Sequence[float], text: str = "") -> list[Plan]:
+    """The error is inside the tolerance for the whole batch, each item of it, and an item by itself."""
+    with torch.no_grad():
+        planner, truth = Planner(shot, light), noiseless_raw(shot)(light)
+        plans = [planner.plan(tolerance) for tolerance in tolerances]
+        for tolerance, plan in zip(tolerances, plans, strict=True):
+            raw = noiseless_raw(plan.apply(shot))(light)
+            errors = [relative_rms(raw, truth), *(relative_rms(a, b) for a, b in zip(raw, truth, strict=True))]
+            if len(raw) > 1:
+                errors += [plan.measure(shot, item_of(light, row)) for row in (0, len(raw) - 1)]
+            assert max(errors) <= tolerance, f"{text} at {tolerance:g}: {max(errors):.3g}"
+            assert plan.bound <= tolerance
+    return plans
+
+
+def with_lamp(light: Scene, *, at: tuple[int, int], radius: float, distance: float, gain: float) -> Scene:
+    _, height, width = light.shape
+    rows, columns = torch.arange(float(height))[:, None], torch.arange(float(width))[None, :]
+    disc = torch.hypot(rows - at[0], columns - at[1]) <= radius
+    depth = torch.where(disc, distance, 2.0).double().expand(1, 1, height, width)
+    return dataclasses.replace(
+        light, coefficients=torch.where(disc, light.coefficients * gain, light.coefficients), depth=depth
+    )
+
+
+def thin(**arguments) -> Camera:
+    lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
+    return Camera(optics.Imaging(lens, pixel_pitch=4 * um, **arguments), *list(camera())[1:])
+
+
+@pytest.mark.parametrize("seed", [1, 6, 9, 17, 23])
+def test_hard_pairs_stay_inside_the_tolerance(seed: int) -> None:
+    """Lamps, batches, saturation, colour edges in depth, hot pixels, wrapped radial profiles: of the campaign."""
+    shot, light, text, _ = hard_pair(seed, sides=(32, 48, 64))
+    assert_inside(shot, light, (0.1, 0.01), text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 124))
+def test_hard_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> None:
+    sides = (384, 560, 768) if seed % 4 == 0 else (64, 96, 160)
+    shot, light, text, _ = hard_pair(seed, sides=sides)
+    assert_inside(shot, light, (0.03, 0.003), text)
+
+
+@pytest.mark.parametrize("seed", [30, 31])
+def test_crops_stand_for_a_picture_whose_last_trial_cannot_see_it_whole(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with pictures of many megapixels: all that is tried is a few crops of the scene."""
+    monkeypatch.setattr(trials, "LARGEST", 64**2)
+    monkeypatch.setattr(trials, "CROP", 32)
+    monkeypatch.setattr(trials, "WITNESSED", 100**2)
+    draw = random.Random(seed)
+    light = dataclasses.replace(scene(256), coefficients=0.3 * scene(256).coefficients)
+    place = draw.randrange(20, 236), draw.randrange(20, 236)
+    light = with_lamp(light, at=place, radius=4, distance=1.2, gain=20)
+    shot = thin()
+    assert_inside(shot, light, (0.03,))
+    tried = Planner(shot, light).trials
+    for samples in (tried.samples, tried.witnesses):
+        assert sum(math.prod(sample.scene.shape) for sample in samples) < 256**2
+
+
+@pytest.mark.slow
+def test_a_lamp_out_of_focus_in_a_corner_is_seen() -> None:
+    light = Scene.builtin("coffee")
+    light = dataclasses.replace(light, coefficients=0.3 * light.coefficients)
+    assert_inside(thin(), with_lamp(light, at=(60, 500), radius=10, distance=0.6, gain=10), (0.01,))
+
+
+def test_one_near_item_among_far_ones_is_seen() -> None:
+    depth = torch.full((8, 1, 48, 48), 2.0, dtype=torch.float64)
+    depth[3] = 0.6
+    light = dataclasses.replace(scene(), coefficients=scene().coefficients.repeat(8, 1, 1, 1), depth=depth)
+    (plan,) = assert_inside(thin(), light, (0.01,))
+    assert plan.reference_seconds > 1.5 * plan.seconds
+
+
+def test_of_many_items_the_worst_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not every second or third: those that stand out, and the ends of the depth that the layers divide."""
+    monkeypatch.setattr(trials, "LARGEST", 4 * 32**2)
+    monkeypatch.setattr(trials, "WITNESSED", 4 * 32**2)
+    depth = torch.full((16, 1, 32, 32), 2.0, dtype=torch.float64)
+    depth[5], depth[9] = 0.8, 2.5
+    planes = scene(32).coefficients.repeat(16, 1, 1, 1)
+    planes[12, :, 10:14, 10:14] *= 50
+    light = dataclasses.replace(scene(32), coefficients=planes, depth=depth)
+    with torch.no_grad():
+        planner = Planner(thin(), light)
+    for samples in (planner.trials.samples, planner.trials.witnesses):
+        assert {5, 9, 12} <= set(samples[0].owners)
+        assert len(samples[0].owners) < 16
+    assert_inside(thin(), light, (0.03,))
+
+
 HARD: dict[str, Callable[[], Scene]] = {
     "black": lambda: Scene.from_bands(torch.zeros(1, 28, 16, 16), depth=2.0),
     "empty": lambda: Scene.from_bands(torch.zeros(0, 28, 16, 16), depth=2.0),
@@ -153,7 +255,7 @@ def test_hard_scenes_are_planned_too(case: str) -> None:
 def test_a_pinhole_on_large_pixels_needs_no_diffraction() -> None:
     lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(20 * mm), focus_distance=2.0)
     shot = Camera(optics.Imaging(lens, pixel_pitch=60 * um), *list(camera())[1:])
-    smooth = Scene.from_rgb(torch.linspace(0.2, 0.8, 32).expand(3, 32, 32), depth=2.0)
+    smooth = Scene.from_rgb(torch.linspace(0.2, 0.8, 16).expand(3, 16, 16), depth=2.0)
     with torch.no_grad():
         plan = shot.explain(smooth, tolerance=0.02, measure=True)
     assert choice(plan, "diffraction") == "none"
@@ -169,7 +271,7 @@ def test_nothing_through_which_a_parameter_trains_is_left_out() -> None:
     )
     read = sensor.ReadNoise(nn.Parameter(torch.tensor(0.1)))
     stages = [optics.Imaging(lens, pixel_pitch=60 * um), *list(camera())[1:5], read, *list(camera())[6:]]
-    smooth = Scene.from_rgb(torch.linspace(0.2, 0.8, 24).expand(3, 24, 24), depth=2.0)
+    smooth = Scene.from_rgb(torch.linspace(0.2, 0.8, 12).expand(3, 12, 12), depth=2.0)
     plan = Camera(*stages).plan(smooth, tolerance=0.1)
     assert choice(plan, "diffraction") != "none"
     assert "ReadNoise" not in {row.effect for row in plan.decisions}
@@ -330,13 +432,107 @@ def test_a_scene_out_of_range_warns() -> None:
             (scene(32, depth=0.5), "comes as near as 0.5 m; the nearest planned for was 1 m"),
             (scene(32, depth=9.0), "goes out to 9 m"),
             (scene(64), "has 64 x 64 pixels; the plan was for 32 x 32"),
-            (Scene.builtin("star", (32, 32)).with_depth(1.0), "times the contrast"),
         ):
             with pytest.warns(OutOfRange, match=text):
                 applied(other)
+        smooth = Scene.from_rgb(torch.linspace(0.4, 0.6, 32).expand(3, 32, 32), depth=1.0)
+        with pytest.warns(OutOfRange, match="times the contrast"):
+            shot.plan(smooth, tolerance=0.05).apply(shot)(scene(32, depth=1.0))
         both = shot.plan([scene(32, depth=1.0), scene(32, depth=0.5)], tolerance=0.05)
         assert both.range.nearest == 2.0
         assert both.measure(shot, scene(32, depth=0.5)) <= 0.05
+
+
+def silent(applied: Camera, light: Scene) -> bool:
+    with torch.no_grad(), warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        applied(light)
+    return not any(issubclass(warning.category, OutOfRange) for warning in found)
+
+
+def later_campaign(seeds: Sequence[int], *, scenes: int) -> tuple[list[bool], list[float]]:
+    """Scenes that plans meet later: whether it warned of each that was like the planned ones; and of each that left
+    the tolerance, 0 if it was warned of, or else its error as a multiple of the tolerance.
+    """
+    like, left = [], []
+    for seed in seeds:
+        shot, light, _, _ = hard_pair(seed, sides=(32, 48))
+        draw = random.Random(f"later/{seed}")
+        with torch.no_grad():
+            planner = Planner(shot, light)
+            plans = [planner.plan(tolerance) for tolerance in (0.1, 0.01)]
+            for _ in range(scenes):
+                later, kind = later_scene(draw, light)
+                truth = noiseless_raw(shot)(later)
+                for plan in plans:
+                    told = plan.outside(shot, later) is not None
+                    error = plan.measure(shot, later, truth=truth) / plan.allowed
+                    like += [told] if kind in LATER[0] else []
+                    left += [0.0 if told else error] if error > 1 else []
+    return like, left
+
+
+def test_later_scenes_are_inside_the_tolerance_or_out_of_range() -> None:
+    like, left = later_campaign([1, 6, 9], scenes=5)
+    assert sum(like) <= 0.1 * len(like)
+    assert left
+    assert not any(left)
+
+
+@pytest.mark.slow
+def test_nearly_all_later_scenes_are_inside_the_tolerance_or_out_of_range() -> None:
+    like, left = later_campaign(range(40, 70), scenes=8)
+    assert len(like) > 100
+    assert sum(like) <= 0.1 * len(like)
+    assert len(left) >= 20
+    assert sum(map(bool, left)) <= 0.05 * len(left)
+    assert max(left) < 5
+
+
+def test_a_dark_scene_is_outside_of_a_plan_for_a_saturated_one() -> None:
+    bright = Scene.from_rgb(torch.ones(1, 3, 48, 48), depth=1.0)
+    bright = dataclasses.replace(bright, coefficients=3 + scene().coefficients)
+    shot = Camera(*(stage for stage in camera() if not isinstance(stage, sensor.ReadNoise)))
+    with torch.no_grad():
+        plan = shot.plan(bright, tolerance=0.01)
+        assert plan.bound < 1e-3
+        assert plan.measure(shot, scene()) > 0.1
+    assert silent(plan.apply(shot), bright)
+    assert "times" in (plan.outside(shot, scene()) or "")
+    assert not silent(plan.apply(shot), scene())
+
+
+def test_noise_that_was_left_out_in_the_light_is_missed_in_the_dark() -> None:
+    light = dataclasses.replace(scene(32), luminance=2e4)
+    stages = list(camera())
+    stages[3] = sensor.Exposure(time=1 / 100)
+    shot = Camera(*stages)
+    with torch.no_grad():
+        plan = shot.plan(light, tolerance=0.01)
+    assert choice(plan, "ReadNoise") == "left out"
+    assert "times less light, and noise is left out" in (
+        plan.outside(shot, dataclasses.replace(light, luminance=20.0)) or ""
+    )
+
+
+def test_the_strictest_scene_sets_the_sensor_s_tolerance() -> None:
+    bright, dark = scene(32), dataclasses.replace(scene(32), coefficients=0.01 * scene(32).coefficients)
+    with torch.no_grad():
+        alone, both = (camera().plan(scenes, tolerance="sensor").allowed for scenes in (bright, [bright, dark]))
+    assert both == pytest.approx(alone)
+
+
+def test_a_plan_of_an_earlier_version_is_loaded_and_asks_for_what_it_knows() -> None:
+    shot = camera()
+    with torch.no_grad():
+        plan = shot.plan(scene(32), tolerance=0.05)
+    content = json.loads(plan.to_json())
+    del content["checked"], content["trained"]
+    for name in ("potential", "light", "depths", "saturated", "darkest", "brightest", "defocus"):
+        del content["range"][name]
+    old = Plan.from_json(json.dumps(content))
+    assert old.outside(shot, Scene.builtin("point_grid", (32, 32)).with_depth(1.0)) is None
+    assert "comes as near" in (old.outside(shot, scene(32, depth=0.5)) or "")
 
 
 def test_explain_reads_well_in_100_columns() -> None:
@@ -385,9 +581,14 @@ def test_a_camera_without_optics_plans_its_sensor() -> None:
 # ---- gradients -----------------------------------------------------------------------------------------------------
 
 
-def test_gradients_through_a_plan_are_within_the_tolerance() -> None:
+def doe_camera() -> Camera:
     phase = nn.Parameter(2 * torch.rand(24, 24, generator=torch.Generator().manual_seed(0)))
-    shot = camera(optics.DOE(phase), diameter=2 * mm)
+    return camera(optics.DOE(phase), diameter=2 * mm)
+
+
+def test_gradients_through_a_plan_are_within_the_tolerance() -> None:
+    shot = doe_camera()
+    (phase,) = shot.parameters()
     light, tolerance = scene(40), 0.1
     plan = shot.plan(light, tolerance=tolerance)
     assert plan.gradients
@@ -401,3 +602,31 @@ def test_gradients_through_a_plan_are_within_the_tolerance() -> None:
     assert float((ours - theirs).norm() / theirs.norm()) <= tolerance
     cosine = float((ours * theirs).sum() / ours.norm() / theirs.norm())
     assert cosine >= 1 - tolerance**2
+
+
+def test_gradients_that_were_not_planned_for_are_said() -> None:
+    shot, light = doe_camera(), scene(24)
+    with torch.no_grad():
+        unaware = shot.plan(light, tolerance=0.1)
+        assert silent(unaware.apply(shot), light)
+    aware = shot.plan(light, tolerance=0.1)
+    assert aware.trained == ("stages.0.lens.elements.2.phase",)
+    applied = unaware.apply(shot)
+    with pytest.warns(OutOfRange, match="flow to 1 parameter .* outside torch.no_grad"):
+        applied(light)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        aware.apply(shot)(light)
+        Plan.from_json(aware.to_json()).apply(shot)(light)
+        noiseless_raw(unaware.apply(shot).requires_grad_(False))(light)
+    shot[1].coefficients = nn.Parameter(torch.as_tensor(shot[1].coefficients))
+    with pytest.warns(OutOfRange, match="flow to 1 parameter"):
+        aware.apply(shot)(light)
+
+
+def test_gradients_towards_the_scene_are_not_planned_for() -> None:
+    shot, light = camera(), scene(24)
+    plan = shot.plan(light, tolerance=0.1)
+    wanted = dataclasses.replace(light, coefficients=light.coefficients.clone().requires_grad_())
+    with pytest.warns(OutOfRange, match="the scene's coefficients .* Use the camera without a plan"):
+        plan.apply(shot)(wanted)
