@@ -66,7 +66,7 @@ def as_numbers(value: Any, *, name: str, expected: str) -> Tensor:
     """A number, a list or a tensor as float64; TypeError that says what was expected for anything else."""
     try:
         return torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         fix = " Write a number, not text." if isinstance(value, str) else ""
         raise TypeError(f"{name} must be {expected}, got {value!r}.{fix}") from error
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,8 @@ IDS = [str(path.relative_to(PACKAGE)) for path in FILES]
 # package. What stands in one row does not know of its neighbours.
 LAYERS = [
     {"kcam.threads"},
-    {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure", "kcam.plain", "kcam.layers"},
+    {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure"}
+    | {"kcam.plain", "kcam.layers", "kcam.compiled"},
     {"kcam.context", "kcam.inputs"},
     {"kcam.spectral", "kcam.files", "kcam.effects"},
     {"kcam.scene"},
@@ -100,6 +103,23 @@ def test_no_print_no_assert_no_bare_raise(path: Path) -> None:
             bare = not isinstance(node.exc, ast.Call) or not (node.exc.args or node.exc.keywords)
             abstract = name == "NotImplementedError"  # a method that a subclass must write
             assert abstract or not (bare and name[:1].isupper()), f"{where}: {name} without a message"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import kcam, kcam.augmentation, kcam.data, kcam.style",
+        "import kcam; kcam.Camera.phone()(kcam.Scene.builtin('star', 32))",
+        "import kcam.augmentation as KC, torch; KC.RandomDefocus(p=1.0)(torch.rand(1, 3, 24, 24))",
+    ],
+    ids=["import", "picture", "augmentation"],
+)
+def test_nothing_that_is_not_compiled_waits_for_the_compiler(code: str) -> None:
+    """torch._dynamo takes 2 s to import, and torch.compiler's own decorators do so."""
+    late = ("torch._dynamo", "torch._inductor", "matplotlib", "cv2", "h5py", "colour")
+    code += f"; import sys; print([name for name in {late} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_typed_package_has_one_version() -> None:

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from kcam.augmentation.base import CameraAugmentation, check_inverse_depth, per_sample, wavelengths_of
 from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
+from kcam.compiled import uncompiled
 from kcam.optics import batch_psf, refractive_index
 from kcam.optics.convolution import Convolution, Renderer
 from kcam.optics.imaging import Layers, layer_shares
@@ -82,7 +83,7 @@ class RandomBlur(CameraAugmentation):
         """One depth: each channel of each sample with its PSF."""
         return convolve(signal, self.kernels(signal, drawn)[:, 0])
 
-    @torch.compiler.disable  # its sizes follow from numbers, at each of which a graph would break
+    @uncompiled  # its sizes follow from numbers, at each of which a graph would break
     def kernels(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """The PSFs for a signal, (B, Z, L, h, w)."""
         wavelengths = wavelengths_of(signal, self.wavelengths)
@@ -219,7 +220,7 @@ class RandomDefocus(RandomBlur):
             rows.append(layers.light)
         return torch.cat(rows)
 
-    @torch.compiler.disable
+    @uncompiled
     def layered(self, signal: Tensor, drawn: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """For one sample and its map: vergences of the layers (Z,) [1/m], and their PSFs (Z, L, h, w).
 

@@ -6,7 +6,6 @@ height and width. They run in the domain, and after the balancing, that measured
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from kornia.color import CFA, raw_to_rgb
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from kcam.compiled import constant
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal, remedy
 from kcam.isp.colour import as_shot_gains, gains_of
@@ -30,12 +30,6 @@ KORNIA_CFA = {"RGGB": CFA.BG, "GRBG": CFA.GB, "GBRG": CFA.GR, "BGGR": CFA.RG}
 BAYER = tuple(KORNIA_CFA)
 SQRT_OFFSET = 3e-3
 """Of full scale, under the square root: see `demosaic`."""
-
-
-def _constant(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compute once per argument; to torch.compile a constant, where a bare lru_cache makes it warn and trace inside."""
-    cached = functools.lru_cache(function)
-    return torch.compiler.assume_constant_result(functools.wraps(function)(lambda *arguments: cached(*arguments)))
 
 
 def _channels(pattern: str) -> int:
@@ -76,7 +70,7 @@ _ACROSS: Tile = ((0, 0, -3, 0, 0), (0, 4, 0, 4, 0), (-3, 0, 12, 0, -3), (0, 4, 0
 _KEEP: Tile = ((0,) * 5, (0,) * 5, (0, 0, 16, 0, 0), (0,) * 5, (0,) * 5)
 
 
-@_constant
+@constant
 def _malvar_weight(tile: Tile) -> list:
     """The filters of the four phases as one 3 x 3 convolution from the 4 phases to 3 channels times 4 phases.
 
@@ -119,7 +113,7 @@ def malvar(mosaic: Tensor, *, pattern: str) -> Tensor:
     return F.pixel_shuffle(F.conv2d(phases, weight), 2)[..., :height, :width]
 
 
-@_constant
+@constant
 def _reach(tile: Tile, channels: tuple[int, ...], count: int, cut: bool) -> int:
     """Least r at which every (2r+1) x (2r+1) window of the pattern holds `count` pixels of each of these channels.
 

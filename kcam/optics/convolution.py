@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from kcam.cache import ValueCache
+from kcam.compiled import uncompiled
 from kcam.effects import Work
 from kcam.optics.autograd import once_differentiable
 from kcam.optics.transforms import fast_length
@@ -473,7 +474,7 @@ def _in_cache(function: Callable[[Tensor], Tensor], planes: Tensor) -> Tensor:
     return out.unflatten(0, planes.shape[:-2])
 
 
-@torch.compiler.disable  # its transforms are compiled code as they are, and each strip would be traced by itself
+@uncompiled  # its transforms are compiled code as they are, and each strip would be traced by itself
 def contract(
     planes: Tensor,
     psfs: Tensor,

@@ -13,7 +13,6 @@ from typing import Any, TypedDict
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 
 from kcam import files, measure, optics
 from kcam.effects import Work
@@ -90,6 +89,8 @@ def calibrate(*, rounds: int = 3, advance: Callable[[str], None] | None = None) 
     Args:      rounds: calls of each, of which the median counts.  advance: told what is being measured.
     Returns:   (kind -> seconds for one operation, the median factor by which they mispredict those pictures).
     """
+    from scipy.optimize import nnls  # imported late: few calibrate
+
     works, times = [], []
     for name, imaging, scene, colours in _pictures():
         if advance is not None:

@@ -60,7 +60,9 @@ def infrared_transmission(wavelengths: Tensor, *, edge: Tensor | float) -> Tenso
 
 
 class GaussianFit(NamedTuple):
-    """Curves as sums of Gaussians: coefficients (C,12) >= 0, the common width [m], and the RMS error of each curve."""
+    """Curves as sums of Gaussians: coefficients (C,12) >= 0, the common width [m], and each curve's RMS error, as a
+    share of green's peak.
+    """
 
     coefficients: Tensor
     width: float
@@ -72,17 +74,33 @@ def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
 
     minimise over sigma = 13..30 nm and alpha >= 0:   sum over channels and wavelengths of (kappa - curve)^2
 
-    Args:      curves: (C, L).  wavelengths: (L,), equally spaced [m].
-    Returns:   coefficients in float64, scaled so that green (channel 1, or the only one) peaks at exactly 1.
+    Args:      curves: (C, L), in any scale.  wavelengths: (L,), equally spaced [m].
+    Returns:   coefficients in float64, scaled so that green (channel 1, or the only one) peaks at exactly 1. What they
+               are held to are the curves over their own green's peak, so a factor in the curves changes nothing.
+    Raises:    ValueError for wavelengths out of range, curves of another shape or not finite, and a green that is 0,
+               or that the Gaussians, centred between 420 and 720 nm, do not reach.
     Source:    Lawson and Hanson, Solving Least Squares Problems (1974), chapter 23: NNLS, as in scipy.
     """
     from scipy.optimize import nnls  # comes with scikit-image; imported late, since few users need it
 
+    grid = wavelength_grid(wavelengths)
+    if not isinstance(curves, Tensor) or curves.ndim != 2 or curves.shape[1] != len(grid) or not len(curves):
+        got = tuple(curves.shape) if isinstance(curves, Tensor) else type(curves).__name__
+        raise ValueError(f"curves must be a tensor (C, {len(grid)}), one value per wavelength, got {got}.")
+    given, green = curves.detach().double().cpu(), min(1, len(curves) - 1)
+    peak = float(given[green].max())
+    if not (given.isfinite().all() and peak > 0):
+        raise ValueError(f"curves must be finite, and green's peak (channel {green}) above 0; it is {peak:g}.")
+    given = given / peak
+    if gaussian_basis(grid, width=30 * nm)[:, given[green].argmax()].sum() < 0.01:
+        at = float(grid[given[green].argmax()]) / nm
+        raise ValueError(f"green (channel {green}) peaks at {at:.0f} nm; the Gaussians, at 420 to 720 nm, end before.")
+
     def fit(width: float) -> GaussianFit:
-        basis = gaussian_basis(wavelengths, width=width)
-        alpha = torch.stack([torch.from_numpy(nnls(basis.T.numpy(), curve)[0]) for curve in curves.double().numpy()])
-        alpha = alpha / (alpha @ basis)[min(1, len(curves) - 1)].max()
-        return GaussianFit(alpha, width, tuple((alpha @ basis - curves).square().mean(1).sqrt().tolist()))
+        basis = gaussian_basis(grid, width=width)
+        alpha = torch.stack([torch.from_numpy(nnls(basis.T.numpy(), curve)[0]) for curve in given.numpy()])
+        alpha = alpha / (alpha @ basis)[green].max()
+        return GaussianFit(alpha, width, tuple((alpha @ basis - given).square().mean(1).sqrt().tolist()))
 
     return min((fit(width * nm) for width in range(13, 31)), key=lambda result: math.hypot(*result.errors))
 

@@ -20,6 +20,7 @@ value per picture, (B,1,1,1). float16 and bfloat16 signals are computed in float
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -47,12 +48,34 @@ def like(value: Tensor | float, signal: Tensor) -> Tensor | float:
     return value.to(signal) if isinstance(value, Tensor) else value
 
 
-def check_not_negative(value: Tensor | float, *, name: str, unit: str) -> None:
-    """ValueError unless every element of `value` is finite and >= 0."""
+MOST_ELECTRONS = 1e30
+"""In a full well, or as the spread of a noise: the square still is a float32."""
+COUNTED = 2.0**40
+"""Electrons up to which torch.poisson is right: from 1e14 its variance is off, by 20 % at 1e16, and from 2^63 electrons
+its counts overflow and are negative.
+"""
+
+
+def check_not_negative(value: Tensor | float, *, name: str, unit: str, most: float = math.inf, fix: str = "") -> None:
+    """ValueError unless every element of `value` is finite, >= 0, and not above `most`."""
     values = as_numbers(value, name=name, expected=f"a number >= 0 {unit}").detach()
     bad = ~((values >= 0) & values.isfinite())
     if bad.any():
         raise ValueError(f"{name} must be finite and >= 0 {unit}, got {values[bad].flatten()[0].item():g}.")
+    if (values > most).any():
+        raise ValueError(f"{name} must be at most {most:g} {unit}, got {values.max().item():g}.{fix and ' '}{fix}")
+
+
+def check_full_well(value: Tensor | float | None) -> None:
+    """ValueError unless every element of a full well is from 1e-3 to 1e30 electrons; None is left to the context."""
+    if value is not None:
+        check_positive(value, name="full_well", unit="electrons")
+        low, high = (float(end) for end in torch.as_tensor(value, dtype=torch.float64).detach().aminmax())
+        if not 1e-3 <= low <= high <= MOST_ELECTRONS:
+            raise ValueError(
+                f"full_well {low if low < 1e-3 else high:g} is outside 0.001..{MOST_ELECTRONS:g} electrons, such as "
+                "10_000."
+            )
 
 
 def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -71,8 +94,10 @@ def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 class _Poisson(torch.autograd.Function):
     @staticmethod
     def forward(rate: Tensor, generator: torch.Generator | None) -> Tensor:
+        few = rate.device.type == "cpu" and not torch.compiler.is_compiling() and not (rate > COUNTED).any()
+        counted = rate if few else rate.clamp(max=COUNTED)
         try:
-            return torch.poisson(rate, generator=generator)
+            count = torch.poisson(counted, generator=generator)
         except RuntimeError as error:
             if not rate.isnan().any():
                 raise
@@ -80,6 +105,10 @@ class _Poisson(torch.autograd.Function):
                 f"the signal has {int(rate.isnan().sum())} values that are NaN: photons cannot be counted. Remove NaN "
                 "where it comes from, or use signal.nan_to_num(0)."
             ) from error
+        if few:
+            return count
+        # beyond, the deviation has the same size in units of its own sigma
+        return torch.where(rate > COUNTED, rate + (count - counted) * (rate / COUNTED).sqrt(), count)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
@@ -101,9 +130,14 @@ def poisson(electrons: Tensor, *, generator: torch.Generator | None = None) -> T
 
     Args:      electrons: expected number lambda >= 0, any shape, float32 or float64.
                generator: source of the draw, on the device of `electrons`; None for torch's default one.
-    Returns:   whole numbers in the dtype of `electrons`.
+    Returns:   whole numbers in the dtype of `electrons`. Above 2^40 they are normal: what is left of the Poisson's
+               skewness there is 1e-6.
     """
     return _Poisson.apply(electrons, generator)
+
+
+OVERFLOWING = 100.0
+"""Full wells that overflow with certainty: more give the same, and an infinite rate could not be drawn."""
 
 
 @in_float32
@@ -126,8 +160,7 @@ def shot_noise(signal: Tensor, *, full_well: Tensor | float, generator: torch.Ge
     Source:    EMVA 1288 release 4.0, eq. (1): photon noise.
     """
     capacity = like(full_well, signal)
-    # A hundred full wells overflow with certainty: the result is the same, and an infinite rate could not be drawn.
-    rate = clip_ste(signal, 0.0, 100.0) * capacity
+    rate = clip_ste(signal, 0.0, OVERFLOWING) * capacity
     return clip_ste(poisson(rate, generator=generator) / capacity, None, 1.0)
 
 
@@ -171,7 +204,9 @@ def dark_electrons(
     """
     mean = electrons_per_second * time
     if temperature is not None:
-        mean = mean * 2 ** ((temperature - reference_temperature) / doubling_temperature)
+        doublings = (temperature - reference_temperature) / doubling_temperature
+        most = 120  # beyond, 2^x would overflow; any well has by then
+        mean = mean * 2 ** (doublings.clamp(max=most) if isinstance(doublings, Tensor) else min(doublings, most))
     return mean
 
 
@@ -191,9 +226,18 @@ def dark_current(
                full_well: saturation capacity [electrons].  generator: see `poisson`.
     Returns:   share of the full well, <= 1.
     """
-    rate = torch.zeros_like(signal) + like(electrons, signal)
+    capacity = like(full_well, signal)
+    rate = torch.zeros_like(signal) + like(_overflowing(electrons, full_well), signal)
     count = poisson(rate, generator=generator)
-    return clip_ste(signal + count / like(full_well, signal), None, 1.0)
+    return clip_ste(signal + count / capacity, None, 1.0)
+
+
+def _overflowing(electrons: Tensor | float, full_well: Tensor | float) -> Tensor | float:
+    """Expected electrons, but no more than overflow the well with certainty."""
+    if not isinstance(electrons, Tensor) and not isinstance(full_well, Tensor):
+        return min(electrons, OVERFLOWING * full_well)
+    wells = torch.as_tensor(electrons, dtype=torch.float64) / torch.as_tensor(full_well).detach()
+    return clip_ste(wells, None, OVERFLOWING) * torch.as_tensor(full_well).detach()
 
 
 def fixed_pattern_fields(shape: tuple[int, ...], *, seed: int) -> Tensor:
@@ -296,8 +340,7 @@ class ShotNoise(RandomStage):
 
     def __init__(self, full_well: Tensor | float | None = None):
         super().__init__()
-        if full_well is not None:
-            check_positive(full_well, name="full_well", unit="electrons")
+        check_full_well(full_well)
         hold(self, full_well=full_well)
 
     def forward(
@@ -336,9 +379,8 @@ class ReadNoise(RandomStage):
 
     def __init__(self, sigma_electrons: Tensor | float = 3.0, *, full_well: Tensor | float | None = None):
         super().__init__()
-        check_not_negative(sigma_electrons, name="sigma_electrons", unit="electrons")
-        if full_well is not None:
-            check_positive(full_well, name="full_well", unit="electrons")
+        check_not_negative(sigma_electrons, name="sigma_electrons", unit="electrons", most=MOST_ELECTRONS)
+        check_full_well(full_well)
         hold(self, sigma_electrons=sigma_electrons, full_well=full_well)
 
     def forward(
@@ -360,7 +402,8 @@ class DarkCurrent(RandomStage):
     It belongs after ShotNoise: before it, the dark electrons would be counted at random twice.
 
     Args:      see `dark_electrons`; full_well: saturation capacity [electrons]; None to take it from the context.
-    Raises:    ValueError for a negative current or time, or a doubling temperature or full well <= 0.
+    Raises:    ValueError for a negative current or time, a doubling temperature or full well <= 0, or a temperature
+               that is none in degrees C.
     """
 
     electrons_per_second: Tensor | float
@@ -383,8 +426,14 @@ class DarkCurrent(RandomStage):
         check_not_negative(electrons_per_second, name="electrons_per_second", unit="electrons / s")
         check_not_negative(time, name="time", unit="s")
         check_positive(doubling_temperature, name="doubling_temperature", unit="K")
-        if full_well is not None:
-            check_positive(full_well, name="full_well", unit="electrons")
+        for name, value in (("temperature", temperature), ("reference_temperature", reference_temperature)):
+            degrees = torch.as_tensor(0.0 if value is None else value).detach()
+            if not ((degrees >= -273.15) & (degrees <= 200)).all():
+                odd = degrees[~((degrees >= -273.15) & (degrees <= 200))].flatten()[0].item()
+                raise ValueError(
+                    f"{name} {odd:g} is outside -273.15..200 degrees C, such as 25. From kelvin subtract 273.15."
+                )
+        check_full_well(full_well)
         hold(
             self,
             electrons_per_second=electrons_per_second,
@@ -420,7 +469,7 @@ class DarkCurrent(RandomStage):
     def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """The square root of the dark electrons."""
         full_well, _ = self._resolve(context, None)
-        return torch.as_tensor(self.electrons()).sqrt() / torch.as_tensor(full_well)
+        return torch.as_tensor(_overflowing(self.electrons(), full_well)).sqrt() / torch.as_tensor(full_well)
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Poisson draws take longer than others."""
@@ -432,16 +481,21 @@ def _add_mean(signal: Tensor, *, electrons: Tensor | float, full_well: Tensor | 
     return clip_ste(signal + like(electrons, signal) / like(full_well, signal), None, 1.0)
 
 
+MOST_PRNU = 0.5
+"""Spread of the gain beyond which many pixels of a sensor would count less than nothing."""
+
+
 class FixedPattern(RandomStage):
     """Gain and offset errors of the pixels, EMVA's PRNU and DSNU, the same in every frame: `fixed_pattern`.
 
     Its mean over sensors is the signal. After ShotNoise its offsets reach the picture whole; before it, negative ones
     would be cut off in the dark.
 
-    Args:      prnu: relative spread of the gain, >= 0.  dsnu: spread of the offset, >= 0 [electrons].
+    Args:      prnu: relative spread of the gain, 0 to 0.5 (0.01 is 1 %).  dsnu: spread of the offset, >= 0 [electrons].
                seed: names the sensor, an integer.
                full_well: saturation capacity [electrons]; None to take it from the context.
-    Raises:    ValueError for a negative spread or a full well <= 0; TypeError for a seed that is no integer.
+    Raises:    ValueError for a negative spread, a prnu above 0.5 or a full well <= 0; TypeError for a
+               seed that is no integer.
     """
 
     prnu: Tensor | float
@@ -457,12 +511,12 @@ class FixedPattern(RandomStage):
         full_well: Tensor | float | None = None,
     ):
         super().__init__()
-        check_not_negative(prnu, name="prnu", unit="(relative gain)")
-        check_not_negative(dsnu, name="dsnu", unit="electrons")
+        percent = f"It is a share: did you mean {prnu} / 100?" if not isinstance(prnu, Tensor) else "It is a share."
+        check_not_negative(prnu, name="prnu", unit="(relative gain)", most=MOST_PRNU, fix=percent)
+        check_not_negative(dsnu, name="dsnu", unit="electrons", most=MOST_ELECTRONS)
         if isinstance(seed, bool) or not isinstance(seed, int):
             raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
-        if full_well is not None:
-            check_positive(full_well, name="full_well", unit="electrons")
+        check_full_well(full_well)
         hold(self, prnu=prnu, dsnu=dsnu, seed=seed, full_well=full_well)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:

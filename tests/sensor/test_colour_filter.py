@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from scipy import optimize
 from torch import nn
 
 from kcam import spectral
@@ -41,6 +42,47 @@ def test_fit_finds_the_coefficients_that_made_a_curve():
     assert fit.width == pytest.approx(20 * nm)
     assert max(fit.errors) < 1e-9
     torch.testing.assert_close(fit.coefficients * curves[1].max(), alpha, atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_fit_does_not_depend_on_the_scale_of_its_curves(seed):
+    """Random humps, in any scale: the width is that of the least residual, and the errors are what they are said."""
+    generator = torch.Generator().manual_seed(seed)
+    count = int(torch.randint(1, 5, (), generator=generator))
+    centres = 440 + 260 * torch.rand(count, 2, 1, generator=generator, dtype=torch.float64)
+    widths = 15 + 60 * torch.rand(count, 2, 1, generator=generator, dtype=torch.float64)
+    humps = torch.exp(-0.5 * ((FINE / nm - centres) / widths) ** 2).sum(1)
+    humps = humps * (0.3 + torch.rand(count, 1, generator=generator))
+    green = humps[min(1, count - 1)].max()
+    one = fit_gaussians(humps / green, wavelengths=FINE)
+    for factor in (1e-6, 0.37, 1.0, 4095.0, 1e12):
+        fit = fit_gaussians(humps * factor, wavelengths=FINE)
+        assert fit.width == one.width
+        torch.testing.assert_close(fit.coefficients, one.coefficients, rtol=0, atol=1e-9)
+        assert fit.errors == pytest.approx(one.errors, abs=1e-9)
+    true = (one.coefficients @ gaussian_basis(FINE, width=one.width) - humps / green).square().mean(1).sqrt()
+    assert one.errors == pytest.approx(true.tolist(), abs=1e-12)
+    residuals = []
+    for width in range(13, 31):  # independently, and without the scaling to a peak of 1, which costs up to 30 %
+        basis = gaussian_basis(FINE, width=width * nm).T.numpy()
+        residuals.append(math.hypot(*(optimize.nnls(basis, hump.numpy())[1] for hump in humps / green)))
+    assert math.hypot(*one.errors) <= 1.5 * min(residuals) / math.sqrt(len(FINE)) + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("curves", "wavelengths", "text"),
+    [
+        (torch.ones(3, 341), FINE / nm, r"wavelength 400 is outside 1e-07..2e-05 m.*did you mean 400 \* nm\?"),
+        (torch.ones(341), FINE, r"curves must be a tensor \(C, 341\), one value per wavelength, got \(341,\)"),
+        (torch.ones(3, 340), FINE, r"curves must be a tensor \(C, 341\).*got \(3, 340\)"),
+        (torch.zeros(3, 341), FINE, r"green's peak \(channel 1\) above 0; it is 0"),
+        (torch.full((1, 341), math.nan), FINE, "curves must be finite"),
+        (torch.ones(1, 3), torch.tensor([1000, 1001, 1002]) * nm, "peaks at 1000 nm; the Gaussians, at 420 to 720 nm"),
+    ],
+)
+def test_what_cannot_be_fitted_is_said(curves, wavelengths, text):
+    with pytest.raises(ValueError, match=text):
+        fit_gaussians(curves, wavelengths=wavelengths)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,17 @@
 import copy
 import inspect
+import math
+import random
+from collections import Counter
+from collections.abc import Callable
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from kcam.context import Context
 from kcam.sensor import ADC, DarkCurrent, FixedPattern, Mean, ReadNoise, ShotNoise, poisson, shot_noise
+from kcam.sensor.noise import RandomStage
 
 STAGES = {
     "ShotNoise": lambda: ShotNoise(5000.0),
@@ -260,6 +265,12 @@ def test_arguments_are_attributes_that_rebuild_the_stage(name):
         (lambda: DarkCurrent(1.0, time=1.0, full_well=0.0), ValueError, "full_well must be"),
         (lambda: FixedPattern(-0.1), ValueError, "prnu must be finite and >= 0"),
         (lambda: FixedPattern(dsnu=-0.1), ValueError, "dsnu must be finite and >= 0 electrons"),
+        (lambda: FixedPattern(6), ValueError, r"prnu must be at most 0.5 \(relative gain\), got 6. .*mean 6 / 100\?"),
+        (lambda: FixedPattern(torch.tensor(1.0)), ValueError, "prnu must be at most 0.5.*It is a share"),
+        (lambda: DarkCurrent(1.0, time=1.0, temperature=300.0), ValueError, "300 is outside .* From kelvin subtract"),
+        (lambda: DarkCurrent(10**400, time=1.0), TypeError, "electrons_per_second must be a number"),
+        (lambda: ReadNoise(1e31), ValueError, r"sigma_electrons must be at most 1e\+30 electrons"),
+        (lambda: ShotNoise(1e31), ValueError, r"full_well 1e\+31 is outside 0.001..1e\+30 electrons"),
         (lambda: FixedPattern(seed=1.5), TypeError, "seed must be an integer such as 0, got 1.5"),
         (lambda: FixedPattern(full_well=0.0), ValueError, "full_well must be"),
     ],
@@ -273,3 +284,85 @@ def test_errors(build, error, text):
 def test_an_integer_signal_is_refused(name):
     with pytest.raises(TypeError, match=r"in which 1.0 is the full well .* of torch.uint8. Use signal.float"):
         STAGES[name]()(torch.zeros(1, 1, 2, 2, dtype=torch.uint8))
+
+
+def magnitude(rng: random.Random, low: float = -6, high: float = 38) -> float:
+    return 10 ** rng.uniform(low, high)
+
+
+def hostile_stage(rng: random.Random) -> tuple[Callable[[], RandomStage], Callable[[Tensor], Tensor]]:
+    """A stage with arguments of any size, and the mean of what it gives, in full wells, before one is full."""
+    well = magnitude(rng, -3, 30)
+    rate, time, spread = magnitude(rng), magnitude(rng), magnitude(rng)
+    held = (lambda value: torch.tensor(value)) if rng.random() < 0.3 else (lambda value: value)
+    kind = rng.choice(["shot", "dark", "read", "fixed"])
+    if kind == "shot":
+        return lambda: ShotNoise(held(well)), lambda signal: signal
+    if kind == "dark":
+        wells = rate / well * time
+        return lambda: DarkCurrent(held(rate), time=time, full_well=well), lambda signal: signal + wells
+    if kind == "read":
+        return lambda: ReadNoise(held(spread), full_well=well), lambda signal: signal
+    return lambda: FixedPattern(0.4 * rng.random(), dsnu=held(spread), full_well=well), lambda signal: signal
+
+
+def check_magnitudes(seed: int) -> str:
+    rng = random.Random(seed)
+    build, mean = hostile_stage(rng)
+    dtype = rng.choice([torch.float32, torch.float64])
+    signal = torch.full((1, 1, 24, 24), rng.choice([0.0, 0.3, 1.0, magnitude(rng, -20, 30)]), dtype=dtype)
+    try:
+        stage = build()
+    except ValueError as error:
+        return f"refused: {str(error).split()[0]}"
+    torch.manual_seed(seed)
+    result, expected = stage(signal), stage.expected(signal)
+    assert result.isfinite().all(), stage
+    assert expected.isfinite().all()
+    if isinstance(stage, (ShotNoise, DarkCurrent)):
+        assert (result >= 0).all()
+        assert (result <= 1).all()
+    true = mean(signal.double())
+    if isinstance(stage, (ShotNoise, DarkCurrent)):
+        true = true.clamp(max=1)
+    sigma = torch.as_tensor(stage.sigma(signal.double())).double().max()
+    slack = 6 * float(sigma) / 24 + 1e-5 * float(true.abs().max())
+    if isinstance(stage, (ShotNoise, DarkCurrent)) and float(true.max()) > 0.5:  # the well takes what goes beyond it
+        slack += 3 * float(sigma)
+    assert abs(float(result.double().mean() - true.mean())) <= slack, (stage, float(result.mean()), float(true.mean()))
+    return "computed"
+
+
+def test_any_magnitude_is_computed_or_refused():
+    outcomes = Counter(check_magnitudes(seed) for seed in range(150))
+    assert outcomes["computed"] > 80
+    assert outcomes["refused: sigma_electrons"] + outcomes["refused: dsnu"] > 5
+    assert len(outcomes) == 3
+
+
+@pytest.mark.slow
+def test_any_of_many_magnitudes_is_computed_or_refused():
+    assert Counter(check_magnitudes(seed) for seed in range(150, 6000))["computed"] > 3000
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rate", [1e11, 1.2e12, 1e15, 1e17, 9.3e18, 1e19, 1e25, 1e30])
+def test_counts_beyond_64_bits_have_their_mean_and_variance(rate, dtype):
+    for rates in (torch.full((40_000,), rate, dtype=dtype), torch.tensor([3.0, rate], dtype=dtype).repeat(40_000)):
+        count = poisson(rates, generator=seeded(2))[rates > 5].double()
+        assert (count >= 0).all()
+        sigma = math.sqrt(rate)
+        rounding = rate * torch.finfo(dtype).eps
+        assert abs(float((count - rate).mean())) <= 5 * sigma / 200 + rounding
+        if sigma > 10 * rounding:
+            assert float((count - rate).std()) == pytest.approx(sigma, rel=0.02)
+    small = poisson(torch.tensor([3.0, rate], dtype=dtype).repeat(40_000), generator=seeded(2))[::2]
+    assert float(small.mean()) == pytest.approx(3.0, abs=0.05)
+
+
+def test_gradients_stay_finite_where_the_dark_floods_the_well():
+    rate = nn.Parameter(torch.tensor(1e38))
+    signal = torch.full((1, 1, 4, 4), 0.1, requires_grad=True)
+    DarkCurrent(rate, time=1e38)(signal, generator=seeded()).sum().backward()
+    assert rate.grad.isfinite()
+    assert signal.grad.isfinite().all()
