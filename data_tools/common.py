@@ -70,6 +70,18 @@ def end(result: dict[str, Any], lines: list[str], *, as_json: bool, failed: dict
     raise typer.Exit(SOME_FAILED if failed else ALL_DONE)
 
 
+def command(main: Callable[..., Any]) -> typer.Typer:
+    """A function as a command; its help as it is written, where typer.run would take [m] for markup and drop it."""
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app.command()(main)
+    return app
+
+
+def run(main: Callable[..., Any]) -> None:
+    """A function as the command of a script."""
+    command(main)()
+
+
 def usage(message: str) -> NoReturn:
     """One line, and the exit status of a wrong call."""
     stop(message, USAGE)

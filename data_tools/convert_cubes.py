@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from common import Json, Workers, end, progress, usage
+from common import Json, Workers, end, progress, run, usage
 
 from kcam.data import FORMATS, PROFILES
 from kcam.data.bands import EDGES, METHODS, parse_bands
@@ -62,4 +62,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import torch
 import typer
-from common import end, progress
+from common import end, progress, run
 
 from kcam import Scene
 from kcam.data import Cube, write_cube
@@ -35,4 +35,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

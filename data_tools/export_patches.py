@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from common import INTERRUPTED, Json, end, progress, stop, usage
+from common import INTERRUPTED, Json, end, progress, run, stop, usage
 
 from kcam.data.export import export_patches
 from kcam.data.patches import StoreError
@@ -29,4 +29,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from common import INTERRUPTED, SOME_FAILED, Json, Workers, end, progress, stop, usage
+from common import INTERRUPTED, SOME_FAILED, Json, Workers, end, progress, run, stop, usage
 
 from kcam.data.patches import Settings, StoreError, StoreStopped, extract, make_plan, parse_split
 
@@ -121,4 +121,4 @@ def _shard(text: str | None) -> tuple[int, int] | None:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from common import Json, end, progress, usage
+from common import Json, end, progress, run, usage
 from rich.console import Console
 from rich.table import Table
 
@@ -71,4 +71,4 @@ def _table(found: list) -> Table:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

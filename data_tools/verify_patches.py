@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from common import Json, end, usage
+from common import Json, end, run, usage
 
 from kcam.data.patches import MANIFEST, verify
 
@@ -25,4 +25,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,7 +26,12 @@ if TYPE_CHECKING:
     from kcam.style import Progress as StepProgress
 
 UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # "rich" would take [pixels] for a style, and drop it
+)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; without it, everything'
@@ -113,9 +119,14 @@ def one_line_errors() -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError, OSError) as error:
-        err.print("[bold red]kcam:[/] ", end="")
-        err.print(" ".join(str(error).split()), markup=False)
+        complain(str(error))
         raise typer.Exit(2) from error
+
+
+def complain(text: str) -> None:
+    """One line on the standard error."""
+    err.print("[bold red]kcam:[/] ", end="")
+    err.print(" ".join(text.split()), markup=False)
 
 
 @contextmanager
@@ -189,16 +200,23 @@ def shoot(
             "tolerance": as_tolerance(tolerance) if tolerance else None,
         }
         pairs = module.outputs(photos, out)
+        failed = []
         with progress("shoot", total=len(pairs)) as advance:
             for photo, target in pairs:
                 try:
                     module.shoot(stages, photo, target, **how)
                 except (ValueError, OSError) as error:
-                    if len(pairs) == 1 or photo.name in str(error):
+                    if len(pairs) == 1:
                         raise
-                    raise ValueError(f"{photo.name}: {error}") from error
+                    failed.append(str(error) if photo.name in str(error) else f"{photo.name}: {error}")
+                else:
+                    typer.echo(target)
                 advance(photo.name)
-                typer.echo(target)
+        for reason in failed:
+            complain(reason)
+        if failed:
+            complain(f"{len(failed)} of {len(pairs)} photos could not be taken.")
+            raise typer.Exit(2)
 
 
 @app.command()
@@ -258,7 +276,7 @@ def explain(
         if photo in BUILTIN:
             scene = Scene.builtin(photo, size or None)
         else:
-            scene = Scene.from_file(photo, depth=length(distance))
+            scene = replace(Scene.from_file(photo), depth=length(distance))
             scene = scene.resized(size) if size else scene
         with torch.no_grad(), progress("explain"):
             plan = planner.explain(stages, scene, tolerance=as_tolerance(tolerance), measure=measure)

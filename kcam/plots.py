@@ -47,7 +47,8 @@ def check_writable(path: str | os.PathLike[str], *, suffixes: Sequence[str] = PI
 def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int = 95) -> None:
     """Write a picture (3,H,W) or (1,H,W) in [0,1] as 8 bits; the suffix names the format.
 
-    Highlights and colours a little outside are clipped; the file is whole or not there.
+    One plane is written as one, and in a TIFF, where it is a raw signal as often as a picture, with 16 bits. Highlights
+    and colours a little outside are clipped; the file is whole or not there.
 
     Raises:    as `check_writable`; TypeError, ValueError for another shape, NaN, or values beyond -1..2.
     """
@@ -57,7 +58,11 @@ def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int
     suffix = Path(path).suffix.lower()
     options: dict[str, Any] = {"quality": quality} if suffix in {".jpg", ".jpeg", ".webp"} else {}
     content = io.BytesIO()
-    pixels = Image.fromarray((image * 255).round().astype(np.uint8))
+    if len(picture) == 1:
+        image = image[..., 0]
+    deep = len(picture) == 1 and suffix in {".tif", ".tiff"}
+    values = image.astype(np.float64) * (65535 if deep else 255)
+    pixels = Image.fromarray(values.round().astype(np.uint16 if deep else np.uint8))
     pixels.save(content, format=Image.registered_extensions()[suffix], **options)
     files.replace(path, content.getvalue())
 
@@ -256,19 +261,26 @@ CURVE_COLOURS = ("#c8553d", "#1c1c22", "#2a9d8f", "#3f6fd8", "#8f5fbf", "#b8860b
 
 
 def psf_figure(
-    imaging: optics.Imaging,
+    imaging: optics.Imaging | optics.Lens,
     *,
     distances: Sequence[float] | None = None,
     wavelengths: Sequence[float] | None = None,
-    title: str,
+    title: str = "Point spread functions",
 ) -> Figure:
     """PSFs over wavelength and distance, in the colour of their light, beside the MTF and the encircled energy.
 
     Each PSF is scaled to its own peak, and its square root is shown, so that a hundredth of the peak is still visible.
 
-    Args:      distances: [m], inf allowed; None for 0.4 times the focus, the focus, 2.5 times that, and infinity.
+    Args:      imaging: an Imaging stage; a Lens is drawn on its default pixels, of 4 um.
+               distances: [m], inf allowed; None for 0.4 times the focus, the focus, 2.5 times that, and infinity.
                wavelengths: [m]; None for 450, 500, 550, 600 and 650 nm.
+    Raises:    TypeError for what is neither.
     """
+    if isinstance(imaging, optics.Lens):
+        imaging = optics.Imaging(imaging)
+    if not isinstance(imaging, optics.Imaging):
+        fix = " Use camera[0], where its optics stand." if hasattr(imaging, "stages") else ""
+        raise TypeError(f"a PSF figure is of an optics.Imaging or a Lens, got {type(imaging).__name__}.{fix}")
     lens, pitch = imaging.lens, float(imaging.pixel_pitch)
     focus = lens.focus_distance
     if distances is None:

@@ -7,6 +7,7 @@ pictures are (three planes and three spectra stand for 28 bands), and rendering 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +23,10 @@ from kcam import spectral
 from kcam.cache import differentiated
 from kcam.inputs import as_map, as_values, band_remedy, check_bands, check_picture, describe, remedy
 from kcam.precision import full_precision
-from kcam.units import LEAST_DISTANCE, check_distances, check_positive, wavelength_grid
+from kcam.units import LEAST_DISTANCE, check_distances, check_positive, warn_of_millimetres, wavelength_grid
+
+ROUGH = 1 / 255
+"""Error of the way from sRGB to spectra and back from which on `Scene.from_rgb` warns of too few bands."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,7 +37,8 @@ class Scene:
 
     The radiance is relative: a perfect white has the illuminant's spectrum, scaled to Y = 1, and `luminance` says how
     bright it is. Derive scenes with the methods, or with `dataclasses.replace`. Gradients reach `coefficients`,
-    `spectra` and a tensor `depth`. Everything is checked here, so stages need not.
+    `spectra` and a tensor `depth`. Everything is checked here, so stages need not. The constructors below also warn
+    (UserWarning) of depths that look like millimetres: all of them finite and 300 m or more.
 
     Args:      coefficients: (B,K,H,W); their dtype and device are the scene's.
                spectra: (K,L), the light included; None if the coefficients are the bands, K = L.
@@ -107,6 +112,7 @@ class Scene:
 
         reflectance = linear rgb @ `spectral.rgb_basis`: three factors, exactly; one, flat, for a grey picture. Under
         D65 the scene has the colours of the picture; under another light, those that such paints would have there.
+        Bands too few for that are warned of (UserWarning), with the error.
 
         Args:      image: (3,H,W), (B,3,H,W), (1,H,W) or (B,1,H,W), sRGB in [0,1] as files have it (gamma-coded).
                    Others: as for `Scene`.
@@ -118,9 +124,16 @@ class Scene:
         channels = image.shape[1]
         linear = rgb_to_linear_rgb(image.expand(-1, 3, -1, -1))[:, :channels]
         grid = wavelength_grid(wavelengths)
+        error = spectral.rgb_error(grid) if channels == 3 else 0.0
+        if error > ROUGH:
+            warnings.warn(
+                f"these {len(grid)} bands do not carry all colours of sRGB: some come back off by {error:.2f}. Use "
+                "more, such as wavelengths=torch.linspace(420, 720, 28) * nm.",
+                stacklevel=2,
+            )
         basis = spectral.rgb_basis(grid) if channels == 3 else torch.ones(1, len(grid))
         light = spectral.illuminant(illuminant, wavelengths=grid)
-        return cls(linear, basis * light, grid, depth, light, luminance)
+        return _in_metres(cls(linear, basis * light, grid, depth, light, luminance))
 
     @classmethod
     def from_bands(
@@ -149,7 +162,7 @@ class Scene:
         light = spectral.illuminant(illuminant, wavelengths=grid)
         if isinstance(illuminant, Tensor):
             bands = bands * (light.sum() / illuminant.detach().double().cpu().sum()).item()
-        return cls(bands, None, grid, depth, light, luminance)
+        return _in_metres(cls(bands, None, grid, depth, light, luminance))
 
     @classmethod
     def from_file(
@@ -242,7 +255,7 @@ class Scene:
 
     def with_depth(self, depth: float | Tensor) -> Scene:
         """The same scene at other distances [m]."""
-        return replace(self, depth=depth)
+        return _in_metres(replace(self, depth=depth))
 
     def resized(self, size: int | tuple[int, int]) -> Scene:
         """The scene at another size: the longer side [pixels], or (height, width), for which it is cropped in its
@@ -342,7 +355,7 @@ def read_picture(path: str | os.PathLike[str]) -> Tensor:
             f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, more than can be "
             "photographed in one piece. Make it smaller first."
         ) from error
-    except (OSError, ValueError, SyntaxError) as error:
+    except Exception as error:  # a damaged header makes Pillow raise anything: SyntaxError, KeyError, struct.error, ...
         raise ValueError(f"cannot read {path} as a picture of 8 or 16 bits: {error}.") from error
     if len(pixels) in (2, 4):
         pixels, alpha = pixels[:-1], pixels[-1:]
@@ -374,6 +387,12 @@ def _product_range(planes: Tensor, spectra: Tensor, low: float, high: float) -> 
         return low * lowest, high * highest
     ranges = [torch.einsum("bkhw,k->bhw", planes, spectrum).aminmax() for spectrum in spectra.T]
     return min(pair.min.item() for pair in ranges), max(pair.max.item() for pair in ranges)
+
+
+def _in_metres(scene: Scene) -> Scene:
+    """A scene that a user made, after a look at its distances."""
+    warn_of_millimetres(scene.depth)
+    return scene
 
 
 def _depth_map(depth: float | Sequence[float] | Tensor, planes: Tensor) -> float | Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -76,7 +77,7 @@ def shoot(
     Args:      size: of the longer side [pixels], to which a larger photo is shrunk first; None: as it is.
     Raises:    ValueError for a distance that is too near, a size above the photo's, or a camera that gives no picture.
     """
-    scene = Scene.from_file(photo, depth=distance)
+    scene = replace(Scene.from_file(photo), depth=distance)  # a length with its unit, or in metres as the help says
     longest = max(scene.shape[1:])
     if size is not None and size > longest:
         raise ValueError(f"{photo.name} has {longest} pixels on its longer side, and --size asks for {size}.")

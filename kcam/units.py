@@ -19,6 +19,7 @@ is turned by 180 degrees.
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import torch
@@ -32,6 +33,8 @@ cm = 1e-2
 WAVELENGTH_RANGE = (1e-7, 2e-5)
 PIXEL_PITCH_RANGE = (1e-7, 1e-3)
 DOE_PITCH_RANGE = (1e-8, 5e-2)
+FAR = 300.0
+"""Metres from which a depth without anything nearer is warned of: in millimetres it would be 0.3 m."""
 LEAST_DISTANCE = 1e-7
 """Of an object, and of a focal length [m]: the shortest wavelength; far below, powers of 1 / distance overflow."""
 
@@ -115,6 +118,18 @@ def check_distances(distance: Tensor | float, *, name: str = "distance") -> Tens
             "2.0."
         )
     return values
+
+
+def warn_of_millimetres(depth: Tensor | float) -> None:
+    """UserWarning where the nearest finite depth is 300 m or more: it was probably meant in millimetres."""
+    values = torch.as_tensor(depth).detach()
+    nearest = float(torch.where(values.isfinite(), values, math.inf).amin()) if values.numel() else math.inf
+    if FAR <= nearest < math.inf:
+        warnings.warn(
+            f"depth {nearest:g} m: depths are in metres; did you mean {nearest:g} * mm? For what is that far away, "
+            "float('inf') looks the same and does not warn.",
+            stacklevel=4,
+        )
 
 
 def check_trained(value: Tensor, *, name: str) -> None:

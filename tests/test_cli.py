@@ -10,14 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import typer
 from commands import fails, run
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 import kcam
 from kcam import Camera, cli, demo, files, plots
+from kcam.scene import read_picture
 from kcam.units import nm
 
 
@@ -254,19 +257,57 @@ def test_a_share_is_never_rounded_up() -> None:
     assert plots.percent_or_more(0.004) == "less than 1%"
 
 
+def test_help_prints_what_was_written() -> None:
+    """[pixels] is no markup, in no command and no option."""
+    app: Any = typer.main.get_command(cli.app)
+    bracketed = 0
+    for name, command in app.commands.items():
+        printed = "".join(unboxed(run(name, "--help")).split())
+        for sentence in (command.help, *(getattr(parameter, "help", None) for parameter in command.params)):
+            assert "".join((sentence or "").split()) in printed, f"{name}: {sentence}"
+            bracketed += "[" in (sentence or "")
+    assert bracketed >= 5
+
+
 def test_help_names_the_units() -> None:
-    """Typer reads [nm] as markup, and drops it."""
     text = unboxed(run("psf", "--help"))
     assert "in metres" in text
     assert "in nanometres" in text
     assert "in metres" in unboxed(run("shoot", "--help"))
 
 
-def test_pictures_on_disk(tmp_path: Path) -> None:
-    picture = torch.tensor([0.0, 0.5, 2.0, -1.0, 0.2, 1.0]).view(1, 2, 3)
-    plots.write_picture(picture, tmp_path / "x.png")
-    with Image.open(tmp_path / "x.png") as image:
-        assert np.asarray(image)[..., 1].tolist() == [[0, 128, 255], [0, 51, 255]]
+@pytest.mark.parametrize("planes", [1, 3])
+@pytest.mark.parametrize("suffix", plots.PICTURE_SUFFIXES)
+def test_pictures_on_disk(suffix: str, planes: int, tmp_path: Path) -> None:
+    """One plane stays one, and in a TIFF a raw keeps its bits."""
+    picture = torch.tensor([0.0, 0.5, 2.0, -1.0, 0.2, 1.0]).view(1, 2, 3).expand(planes, -1, -1)
+    plots.write_picture(picture, tmp_path / f"x{suffix}")
+    deep = planes == 1 and suffix.startswith(".tif")
+    with Image.open(tmp_path / f"x{suffix}") as image:
+        values = np.asarray(image)
+        assert image.mode == (("I;16" if deep else "L") if planes == 1 and suffix != ".webp" else "RGB")
+    expected = np.array([[0, 0.5, 1], [0, 0.2, 1]]) * (65535 if deep else 255)
+    lossy = suffix in (".jpg", ".jpeg", ".webp")
+    assert np.abs(values[..., 1] - expected if values.ndim == 3 else values - expected).max() <= (25 if lossy else 0.5)
+    back = read_picture(tmp_path / f"x{suffix}")
+    assert back.shape[1:] == (2, 3)
+    assert lossy or (back - picture.clamp(0, 1)).abs().max() <= (0.5 / 65535 if deep else 0.5 / 255) * 1.01
+
+
+def test_a_raw_of_twelve_bits_comes_back_from_a_tiff(tmp_path: Path) -> None:
+    raw = torch.randint(0, 4096, (1, 40, 50)) / 4095
+    plots.write_picture(raw, tmp_path / "raw.tif")
+    assert torch.equal((read_picture(tmp_path / "raw.tif") * 4095).round(), raw * 4095)
+
+
+def test_a_psf_figure_of_a_lens() -> None:
+    lens = Camera.phone()[0].lens
+    figure = plots.psf_figure(lens, distances=[2.0], wavelengths=[550 * nm])
+    assert any("pixels of 4" in text.get_text() for text in figure.findobj(Text))
+    with pytest.raises(TypeError, match=r"of an optics.Imaging or a Lens, got Camera. Use camera\[0\]"):
+        plots.psf_figure(Camera.phone())
+    with pytest.raises(TypeError, match="got str"):
+        plots.psf_figure("thesis")
 
 
 @pytest.mark.parametrize("suffix", plots.PICTURE_SUFFIXES)

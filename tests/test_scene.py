@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,6 +64,46 @@ class TestFromRgb:
         torch.testing.assert_close(scene.to_srgb()[0], picture(3, 4, 5), rtol=0, atol=3e-6)
         assert scene.luminance == 50.0
         assert Scene.from_rgb(picture(3, 4, 5), wavelengths=[550 * nm]).bands().shape == (1, 1, 4, 5)
+
+    @pytest.mark.parametrize("count", [1, 3, 6, 10])
+    def test_bands_that_cannot_carry_the_colours_are_warned_of_with_the_error(self, count: int) -> None:
+        grid = wavelength_grid(count=count)
+        text = rf"these {count} bands do not carry all colours of sRGB: some come back off by \d.\d\d"
+        with pytest.warns(UserWarning, match=text) as seen:
+            scene = Scene.from_rgb(torch.rand(3, 30, 40), wavelengths=grid)
+        stated = float(str(seen[0].message).split("off by ")[1][:4])
+        assert stated == pytest.approx(spectral.rgb_error(grid), abs=0.006)
+        assert scene.shape == (1, 30, 40)
+
+    @pytest.mark.parametrize("build", ["rgb", "bands", "with_depth", "file"])
+    def test_depths_in_millimetres_are_warned_of_and_landscapes_are_not(self, build: str, tmp_path: Path) -> None:
+        image = torch.rand(3, 4, 6)
+        Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(tmp_path / "x.png")
+
+        def make(depth: float | torch.Tensor) -> Scene:
+            match build:
+                case "rgb":
+                    return Scene.from_rgb(image, depth=depth)
+                case "bands":
+                    return Scene.from_bands(torch.rand(28, 4, 6), depth=depth)
+                case "file":
+                    return Scene.from_file(tmp_path / "x.png", depth=depth)
+            return Scene.from_rgb(image).with_depth(depth)
+
+        ramp = torch.linspace(0, 1, 24).view(4, 6)
+        inf = float("inf")
+        for depth in (2000, 500.0, 300, 400 + 5000 * ramp, torch.where(ramp > 0.5, inf, 700.0), torch.tensor(1e5)):
+            with pytest.warns(UserWarning, match=r"depth \d+(e\+05)? m: depths are in metres; did you mean .* \* mm\?"):
+                made = make(depth)
+        made.crop(top=0, left=0, height=2, width=2)  # said once: not again of what is made of it
+        for depth in (2.0, 299, inf, 2 + 5000 * ramp, torch.where(ramp > 0.5, inf, 20.0), torch.full((4, 6), inf)):
+            make(depth)
+
+    def test_bands_that_carry_them_and_grey_pictures_are_not(self) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            Scene.from_rgb(torch.rand(3, 4, 5), wavelengths=wavelength_grid(count=12))
+            Scene.from_rgb(torch.rand(1, 4, 5), wavelengths=wavelength_grid(count=3))
 
     def test_gradient_reaches_the_picture(self) -> None:
         image = torch.zeros(3, 2, 2, dtype=torch.float64)
@@ -548,3 +589,23 @@ class TestReadPicture:
         (tmp_path / "deep.png").write_bytes(content[: len(content) // 2])
         with pytest.raises(ValueError, match="cannot read .*deep.png"):
             read_picture(tmp_path / "deep.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp", ".bmp", ".gif"])
+def test_a_damaged_picture_is_refused_by_its_name_or_read(suffix: str, tmp_path: Path) -> None:
+    """Cut at any place, and with bytes changed: Pillow raises whatever it likes."""
+    generator = np.random.default_rng(0)
+    Image.fromarray(generator.integers(0, 256, (9, 12, 3), dtype=np.uint8)).save(tmp_path / f"whole{suffix}")
+    whole, path = (tmp_path / f"whole{suffix}").read_bytes(), tmp_path / f"x{suffix}"
+    for trial in range(40):
+        held = bytearray(whole[: generator.integers(0, len(whole))] if trial % 2 else whole)
+        for _ in range(trial % 4 * (len(held) > 0)):
+            held[int(generator.random() ** 3 * len(held))] = generator.integers(0, 256)
+        path.write_bytes(held)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's own, of what it could read
+            try:
+                assert read_picture(path).isfinite().all()
+            except ValueError as error:
+                if path.name not in str(error):
+                    raise AssertionError(str(error)) from error

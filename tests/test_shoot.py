@@ -233,22 +233,32 @@ def test_many_photos_are_sorted_out_in_no_time(tmp_path: Path) -> None:
 # ---- what goes wrong on the way -------------------------------------------------------------------------------------
 
 
-def test_an_error_leaves_what_was_taken_before(folder: Path, tmp_path: Path) -> None:
-    (folder / "c.tif").write_bytes((folder / "c.tif").read_bytes()[:200])
+@pytest.mark.parametrize("damaged", [("a.jpg",), ("c.tif",), ("a.jpg", "c.tif"), ("a.jpg", "b.PNG", "c.tif", "d.png")])
+def test_what_cannot_be_read_stops_none_of_the_others(damaged: tuple[str, ...], folder: Path, tmp_path: Path) -> None:
+    """As with cp: each of the others is taken, each failure is said, and the status is not 0."""
     make_photo(folder / "d.png")
-    *taken, line = run("shoot", folder, "--camera", "ideal", "--out", tmp_path / "shots", status=2).splitlines()
-    assert taken == [str(tmp_path / "shots" / name) for name in ("a.png", "b.png")]
-    assert line.startswith(f"kcam: cannot read {folder / 'c.tif'} as a picture")
-    assert sorted(path.name for path in (tmp_path / "shots").iterdir()) == ["a.png", "b.png"]
-    assert pixels(tmp_path / "shots" / "b.png").shape == (HEIGHT, WIDTH, 3)
+    for name in damaged:
+        (folder / name).write_bytes((folder / name).read_bytes()[:60])
+    whole = [name for name in ("a.jpg", "b.PNG", "c.tif", "d.png") if name not in damaged]
+    lines = run("shoot", folder, "--camera", "ideal", "--out", tmp_path / "shots", status=2).splitlines()
+    shots = [tmp_path / "shots" / f"{name[0]}.png" for name in whole]
+    assert lines[: len(whole)] == [str(shot) for shot in shots]
+    for name, line in zip(damaged, lines[len(whole) : -1], strict=True):
+        assert line.startswith(f"kcam: cannot read {folder / name} as a picture")
+    assert lines[-1] == f"kcam: {len(damaged)} of 4 photos could not be taken."
+    for shot in shots:
+        assert pixels(shot).shape == (HEIGHT, WIDTH, 3)
+    assert len(shots) == (len(list((tmp_path / "shots").iterdir())) if shots else 0)
 
 
 def test_an_error_of_the_camera_says_which_photo(folder: Path, tmp_path: Path) -> None:
     """The third is so small that the blur is wider than it."""
     make_photo(folder / "c.tif", width=8, height=6)
     shots = tmp_path / "shots"
-    line = run("shoot", folder, "--camera", "phone", "--distance", "0.2", "--out", shots, status=2).splitlines()[-1]
+    how = ("--camera", "phone", "--distance", "0.2", "--out", shots)
+    *_, line, last = run("shoot", folder, *how, status=2).splitlines()
     assert line.startswith("kcam: c.tif: distance 0.2 m is too near")
+    assert last == "kcam: 1 of 3 photos could not be taken."
     assert len(list((tmp_path / "shots").iterdir())) == 2
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import optimize
 from torch import Tensor
 
 from kcam import spectral
@@ -242,6 +243,37 @@ class TestRgbBasis:
         assert (back - torch.eye(3)).abs().max() < limit
         assert -1e-15 <= basis.min() < basis.max() <= 1
         torch.testing.assert_close(basis.sum(0), torch.ones(count).double(), rtol=0, atol=1e-12)
+
+    def test_uneven_bands_of_the_issue_are_exact(self) -> None:
+        grid = torch.cat([torch.linspace(420, 500, 20), torch.linspace(520, 720, 8)]).double() * nm
+        assert spectral.rgb_error(grid) < 1e-12
+
+    @pytest.mark.parametrize("seeds", [range(20), pytest.param(range(20, 400), marks=pytest.mark.slow)])
+    def test_any_bands_are_exact_where_linear_programming_finds_a_way(self, seeds: range) -> None:
+        """B >= 0, columns that add up to 1, B A = 1: whether there is such a B at all is known independently."""
+        exact = 0
+        for seed in seeds:
+            generator = np.random.default_rng(seed)
+            count = int(generator.integers(3, 40))
+            grid = torch.tensor(np.sort(generator.uniform(400, 720, count))) * nm
+            if seed % 3 == 0:  # even ones, moved a little
+                grid = wavelength_grid(count=count) + torch.tensor(generator.normal(0, 2, count)) * nm
+            basis = spectral.rgb_basis(grid)
+            assert basis.min() >= 0
+            torch.testing.assert_close(basis.sum(0), torch.ones(count).double(), rtol=0, atol=1e-9)
+            to_rgb = (spectral.xyz_weights(grid, "D65") @ spectral.xyz_to_srgb_matrix().T).numpy()
+            equations = np.concatenate([np.kron(np.eye(3), to_rgb.T), np.tile(np.eye(count), 3)])
+            aims = np.concatenate([np.eye(3).ravel(), np.ones(count)])
+            found = optimize.linprog(np.zeros(3 * count), A_eq=equations, b_eq=aims, bounds=(0, None))
+            error = spectral.rgb_error(grid)
+            assert (error < 1e-7) == (found.status == 0), f"{seed}: {error}, {found.message}"
+            exact += error < 1e-12
+            colours = generator.random((300, 3))
+            linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+            back = (linear @ basis.numpy() @ to_rgb).clip(0, 1)
+            back = np.where(back <= 0.0031308, 12.92 * back, 1.055 * back ** (1 / 2.4) - 0.055)
+            assert np.abs(back - colours).max() <= 1.1 * error + 1e-12
+        assert exact > 0.4 * len(seeds)
 
     def test_stays_close_to_mallett(self, colour) -> None:
         for rgb in np.random.default_rng(0).random((20, 3)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import torch
 from torch import Tensor
@@ -487,6 +488,7 @@ class RandomVignetting(CameraAugmentation):
 
     Args:      field: full angle between opposite corners [degrees]; 47 is a 50 mm lens on full frame, 75 a phone.
                shade: share of the pupil that the corner does not see.
+    Warns:     UserWarning for a field of at most pi degrees, which darkens no corner: it was probably meant in radians.
     Source:    the cos^4 law: Born and Wolf, Principles of Optics, section 4.8.
     """
 
@@ -504,6 +506,14 @@ class RandomVignetting(CameraAugmentation):
             "shade": Uniform(shade, least=0.0, most=1.0),
         }
         super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        widest = float(torch.as_tensor(field).detach().max())
+        if 0 < widest <= math.pi:
+            darkened = 1 - math.cos(math.radians(widest) / 2) ** 4
+            warnings.warn(
+                f"a field of {widest:g} degrees darkens the corners by {darkened:.2%}. Angles are in degrees; did you "
+                f"mean {math.degrees(widest):.3g}, which is {widest:g} rad?",
+                stacklevel=2,
+            )
 
     @staticmethod
     def falloff(shape: tuple[int, int], *, drawn: dict[str, Tensor], like: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from kcam.data.cube import SUFFIX, CubeError, words_of, write_source
-from kcam.data.readers import Options, open_source, resampled, scene_name, scenes_in
+from kcam.data.readers import SUFFIXES, Options, open_source, resampled, scene_name, scenes_in
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,11 @@ def convert(
     jobs: dict[str, Path] = {}
     for given in inputs:
         try:
-            for path in scenes_in(Path(given)):
+            scenes = list(scenes_in(Path(given)))
+            if not scenes:
+                known = ", ".join(SUFFIXES)
+                report.failed[str(given)] = f"there is no scene in it: expected {known}, or a folder X_ms of PNGs."
+            for path in scenes:
                 name = scene_name(path)
                 if name in jobs and path.resolve() == jobs[name].resolve():
                     continue

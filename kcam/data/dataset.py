@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import operator
 import os
 from itertools import accumulate
 from pathlib import Path
@@ -35,7 +36,8 @@ class PatchDataset(Dataset[Patch]):
     touches nothing but its bytes.
 
     Args:      folder: a split, such as "patches/train".
-    Raises:    FileNotFoundError; StoreError for a damaged manifest, and at access for a file that is cut off.
+    Raises:    FileNotFoundError; StoreError for a damaged manifest, and at access for a file that is cut off; at access
+               TypeError for an index that is no whole number, IndexError for one beyond the last.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -87,8 +89,16 @@ class PatchDataset(Dataset[Patch]):
 
     def _place(self, index: int) -> tuple[int, int]:
         count = len(self)
+        try:
+            index = operator.index(index)
+        except TypeError:
+            some = "range(3)" if isinstance(index, slice) else "[0, 2, 5]"
+            raise TypeError(
+                f"a patch is asked for by a whole number, got {index!r}. For several use "
+                f"torch.utils.data.Subset(patches, {some})."
+            ) from None
         if not -count <= index < count:
             raise IndexError(f"patch {index} of {count}.")
-        index = int(index) % count
+        index %= count
         place = bisect.bisect_right(self._ends, index)
         return place, index - (self._ends[place - 1] if place else 0)

@@ -408,7 +408,10 @@ def _mat_array(path: Path, name: str) -> np.ndarray:
     from scipy.io import loadmat
 
     _check_mat_tags(path)
-    sizes = _check_size(_mat_arrays(path).get(name, (0,)), f"its {name!r}")
+    arrays = _mat_arrays(path)
+    if name not in arrays:
+        raise CubeError(f"it has no array {name!r}, only {', '.join(sorted(arrays)) or 'nothing'}.")
+    sizes = _check_size(arrays[name], f"its {name!r}")
     _check_bomb(int(np.prod(sizes, dtype=np.int64)), path.stat().st_size, f"its {name!r}")  # at a byte a value
     found = loadmat(str(path), variable_names=[name]).get(name)
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fui":
@@ -418,9 +421,10 @@ def _mat_array(path: Path, name: str) -> np.ndarray:
 
 def _open_harvard(path: Path, options: Options) -> Source:
     """Harvard (Chakrabarti and Zickler 2011): `ref` (H,W,31), `lbl` 0 where invalid; calib.txt beside it divides."""
-    values = _mat_array(path, options.key or "ref")
+    key = options.key or "ref"
+    values = _mat_array(path, key)
     if values.ndim != 3:
-        raise CubeError(f"its 'ref' has shape {values.shape}, expected (H,W,31).")
+        raise CubeError(f"its {key!r} has shape {values.shape}, expected (H,W,31).")
     calibration = next((p for p in (path.parent / "calib.txt", path.parent.parent / "calib.txt") if p.is_file()), None)
     if calibration is None:
         raise CubeError("there is no calib.txt beside it, without which its bands cannot be compared.")
@@ -435,7 +439,7 @@ def _open_harvard(path: Path, options: Options) -> Source:
         valid = labels > 0
     cube = (values / divisors).transpose(2, 0, 1)
     grid = _known(path, options, len(cube), PROFILES["harvard31"] * nm)
-    facts = {"scaling": "ref / calib.txt", "orientation": "as stored"}
+    facts = {"scaling": f"{key} / calib.txt", "orientation": "as stored"}
     return Source(scene_name(path), cube.shape, grid, "relative radiance", _whole(cube, valid), facts)
 
 
@@ -453,7 +457,9 @@ def _open_cassi(path: Path, options: Options) -> Source:
     """28-band .mat files of the CASSI papers (DGSMP, TSA-Net, MST) and DeepCASSI's 31: (H,W,L)."""
     names = _mat_arrays(path)
     key = options.key or next((name for name in _CASSI_KEYS if name in names), None)
-    if key is None or key not in names:
+    if options.key is not None and options.key not in names:
+        raise CubeError(f"it has no array {options.key!r}, only {', '.join(names) or 'nothing'}.")
+    if key is None:
         raise CubeError(f"it has none of the arrays {', '.join(_CASSI_KEYS)}, only {', '.join(names) or 'nothing'}.")
     divisor, clip, group = _CASSI_KEYS.get(key, (1.0, False, None))
     values = _mat_array(path, key)
@@ -677,7 +683,9 @@ def _open_npz(path: Path, options: Options) -> Source:
                     shape, _, dtype = reader(file)
                 heads[member.filename.removesuffix(".npy")] = (shape, dtype, member)
     key = options.key or next((name for name in _NPZ_KEYS if name in heads and len(heads[name][0]) == 3), None)
-    if key is None or key not in heads:
+    if options.key is not None and options.key not in heads:
+        raise CubeError(f"it has no array {options.key!r}, only {', '.join(heads) or 'nothing'}.")
+    if key is None:
         raise CubeError(
             f"it has no array {' or '.join(_NPZ_KEYS)} of three axes, only {', '.join(heads) or 'nothing'}."
         )

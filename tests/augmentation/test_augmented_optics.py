@@ -516,3 +516,15 @@ def test_wavelengths_must_fit_the_channels() -> None:
     lens = round_lens(8 * mm, 16.0)
     grid = wavelength_grid([450 * nm, 550 * nm])
     assert relative(found, imaged(lens, signal, augmentation=given, wavelengths=grid)) < SAMPLINGS
+
+
+@pytest.mark.parametrize("field", [1.2, (0.3, 1.4), (0.0, 3.14), torch.tensor([0.5, 0.9])])
+def test_a_field_in_radians_is_warned_of(field) -> None:
+    text = r"degrees darkens the corners by 0.\d\d%. Angles are in degrees; did you mean"
+    with pytest.warns(UserWarning, match=text):
+        KC.RandomVignetting(field=field)
+
+
+@pytest.mark.parametrize("field", [0.0, 5.0, (0.0, 47.0), (20.0, 80.0)])
+def test_a_field_in_degrees_is_not(field) -> None:
+    KC.RandomVignetting(field=field)

@@ -14,7 +14,9 @@ import fuzz
 import numpy as np
 import pytest
 import resident
+import stores
 import tifffile
+import typer
 import writers
 from typer.testing import CliRunner
 
@@ -63,6 +65,36 @@ FORMATS = {
     "npz": ("npz", ["--edge", "hold"]),
     "tiff": ("tiff pages u2", ["--profile", "cave31", "--edge", "hold"]),
 }
+
+
+@pytest.mark.parametrize("inside", [(), ("notes.txt",), ("sub",), (".hidden.npz",)])
+def test_a_folder_without_scenes_is_a_failure(inside: tuple[str, ...], tmp_path: Path) -> None:
+    """Alone, and beside one that has scenes, which are converted."""
+    empty, full = tmp_path / "empty", tmp_path / "full"
+    empty.mkdir()
+    full.mkdir()
+    for name in inside:
+        (empty / name).mkdir() if name == "sub" else (empty / name).write_text("")
+    report = convert([empty], tmp_path / "out")
+    assert report.failed == {str(empty): report.failed[str(empty)]}
+    assert "there is no scene in it: expected .exr, .mat" in report.failed[str(empty)]
+    writers.npz(full)
+    report = convert([empty, full], tmp_path / "out")
+    assert len(report.written) == 1
+    assert list(report.failed) == [str(empty)]
+    result = stores.call("convert_cubes", empty, "--out", tmp_path / "cubes", status=1)
+    assert f"failed: {empty}: there is no scene in it" in result
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in stores.TOOLS.glob("*_*.py")))
+def test_help_prints_what_was_written(name: str) -> None:
+    """[m], [pixels] and kcam[dask] are no markup."""
+    tool = stores.tool(name)
+    app = stores.tool("common").command(tool.main)
+    printed = CliRunner().invoke(app, ["--help"]).output.replace("\u2502", " ")
+    command: Any = typer.main.get_command(app)
+    for sentence in (command.help, *(getattr(parameter, "help", None) for parameter in command.params)):
+        assert "".join((sentence or "").split()) in "".join(printed.split())
 
 
 @pytest.mark.parametrize("name", FORMATS)

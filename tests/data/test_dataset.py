@@ -60,6 +60,27 @@ def test_indices_from_either_end(patches: PatchDataset, kind):
             patches.position(index)
 
 
+@pytest.mark.parametrize(
+    ("index", "fix"),
+    [
+        (1.5, r"Subset\(patches, \[0, 2, 5\]\)"),
+        (1.0, "Subset"),
+        (slice(3), r"Subset\(patches, range\(3\)\)"),
+        ([0, 1], "Subset"),
+        ("1", "Subset"),
+        (None, "Subset"),
+        (torch.tensor([0, 1]), "Subset"),
+        (np.float64(2.0), "Subset"),
+    ],
+    ids=str,
+)
+def test_what_is_no_index_says_what_to_do(patches: PatchDataset, index, fix: str):
+    for ask in (patches.__getitem__, patches.position):
+        with pytest.raises(TypeError, match=f"a patch is asked for by a whole number, got .*{fix}"):
+            ask(index)
+    assert len(torch.utils.data.Subset(patches, range(3))) == 3
+
+
 def test_iterating_ends(patches: PatchDataset):
     assert sum(1 for _ in patches) == len(patches)  # type: ignore[attr-defined]
 

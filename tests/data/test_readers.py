@@ -217,6 +217,15 @@ def test_scene_names_hold_no_path_and_no_odd_letters() -> None:
 # ---- sizes, types and companions
 
 
+@pytest.mark.parametrize("name", ["harvard", "cassi HSI", "icvl", "arad1k", "npz"])
+def test_a_key_that_is_not_there_is_said_with_those_that_are(name: str, tmp_path: Path) -> None:
+    written = writers.ALL[name](tmp_path)
+    with pytest.raises(CubeError, match=rf"{written.path.name}: it has no array 'nothing', only \w+") as found:
+        read_cube(written.path, key="nothing", format=name.split()[0].replace("cassi", "cassi28"))
+    own = {"harvard": "ref", "cassi HSI": "HSI", "icvl": "rad", "arad1k": "cube", "npz": "wavelengths"}[name]
+    assert own in str(found.value)
+
+
 def test_harvard_needs_its_calibration_and_its_mask_to_fit(tmp_path: Path) -> None:
     written = writers.harvard(tmp_path)
     (tmp_path / "calib.txt").write_text("1\n" * 30)
