@@ -101,8 +101,9 @@ class RandomCamera(CameraAugmentation):
         if nearest is not None:
             beyond = 2.0 ** math.ceil(math.log2(nearest)) if nearest > near else 0.0
             near, far = max(near, beyond), 0.0
-        key = (index, shape, beyond, self.tolerance, None if bands is None else tuple(bands.tolist()))
         camera: Any = self.cameras[index]
+        trains = torch.is_grad_enabled() and any(p.requires_grad for p in camera.parameters())  # a plan for gradients
+        key = (index, shape, beyond, trains, self.tolerance, None if bands is None else tuple(bands.tolist()))
         settings = Settings(camera)
         if key not in self._planned or self._planned[key][0] != settings:
             scene = Scene.builtin(_SCENE, shape, wavelengths=bands).to(device=signal.device)

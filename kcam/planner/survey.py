@@ -72,13 +72,16 @@ class Defocus:
         with torch.no_grad():
             query = imaging._query(wavelengths, torch.zeros(1, dtype=torch.float64), (1, 1), torch.empty(0))
             low, high = sorted((-residual_vergence(query)).aminmax())
-            middle = (low + high)[None] / 2
+            middle = ((low + high)[None] / 2).clamp(min=1e-9)  # a lens may be focused behind itself
             query = imaging._query(wavelengths, middle.cpu(), (1, 1), torch.empty(0))
             semi, distance = float(query.semi_aperture), float(query.sensor_distance)
             spread = semi * distance / imaging.pixel_pitch
             rays = float(query.displacement.max()) + imaging.lens.pixel_phase_displacement(query)
             airy = 0.61 * float(wavelengths.max()) * distance / semi
-        floor = max(0.0, rays / imaging.pixel_pitch - spread * float(high - low) / 2) + airy / imaging.pixel_pitch
+        floor = (
+            max(0.0, rays / imaging.pixel_pitch - spread * float(torch.maximum(high - middle, middle - low)))
+            + airy / imaging.pixel_pitch
+        )
         return cls((float(low), float(high)), spread, floor)
 
     def radius(self, vergence: Tensor) -> Tensor:

@@ -174,6 +174,18 @@ def test_gradients_reach_the_picture_and_a_camera_of_ones_own() -> None:
     assert not any(parameter.requires_grad for parameter in KC.RandomCamera(["phone", "thesis"]).parameters())
 
 
+def test_a_plan_without_gradients_is_not_trained_through() -> None:
+    """A validation pass before the training must not leave its plan to it."""
+    focal_length = nn.Parameter(torch.tensor(4.3 * mm, dtype=torch.float64))
+    augmentation = KC.RandomCamera([small_camera(focal_length=focal_length)], 0.1)
+    signal = photographs(1)
+    with torch.no_grad():
+        quick = augmentation.planned(0, signal)
+    assert augmentation.planned(0, signal) is not quick
+    with torch.no_grad():
+        assert augmentation.planned(0, signal) is quick
+
+
 def test_a_saved_camera_takes_the_same_pictures(tmp_path: Path) -> None:
     camera = small_camera()
     camera.save(tmp_path / "own.safetensors")

@@ -158,6 +158,11 @@ def thin(**arguments) -> Camera:
     return Camera(optics.Imaging(lens, pixel_pitch=4 * um, **arguments), *list(camera())[1:])
 
 
+def test_a_lens_that_is_focused_behind_itself_is_planned() -> None:
+    lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), sensor_distance=49 * mm)
+    assert_inside(Camera(optics.Imaging(lens, pixel_pitch=6 * um), *list(camera())[1:]), scene(24), (0.02,))
+
+
 @pytest.mark.parametrize("seed", [1, 6, 9, 17, 23])
 def test_hard_pairs_stay_inside_the_tolerance(seed: int) -> None:
     """Lamps, batches, saturation, colour edges in depth, hot pixels, wrapped radial profiles: of the campaign."""
