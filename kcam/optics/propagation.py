@@ -142,9 +142,10 @@ def _radial_estimate(query: Query) -> float:
 def _spectrum_estimate(query: Query) -> float:
     """1e-3 for a smooth pupil; pixels are looked up at the grid's points, which misplaces every jump by up to half one.
 
-    White noise of 6 radians is then off by 0.3, a square rim by 1e-2.
+    White noise of 6 radians is then off by 0.3, a square rim by 1e-2; rings that scatter beyond its grid by 3e-3.
     """
-    return 1e-3 + (7e-3 if not query.lens.round else 0.0) + 0.12 * jumps(query)
+    rim, rings = 0.0 if query.lens.round else 7e-3, 2e-3 if query.lens.has_rings else 0.0
+    return 1e-3 + rim + rings + 0.12 * jumps(query)
 
 
 def _grid_sizes(query: Query) -> list[tuple[int, int]]:

@@ -196,21 +196,21 @@ def test_the_default_window_holds_the_light_of_rings(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1000, 1100, 20))
+@pytest.mark.parametrize("first", range(1000, 1060, 10))
 def test_many_random_profiles_are_right_in_every_row_and_their_windows_hold_the_light(first: int) -> None:
     gathered: dict[str, list[float]] = {}
-    for seed in range(first, first + 20):
+    for seed in range(first, first + 10):
         rings = random_rings(seed)
         asked, image = rings.query(), rings.image()
         airy = rings.wavelength * rings.lens.f_number
         reach = float(asked.spread(1e-4)[0])
-        if reach < 700 * airy:  # else the truth takes minutes
+        if reach < 300 * airy:  # else the truth takes minutes
             assert window_loss(rings) <= 1e-3, seed
         for (physics, method), row in PROPAGATORS.items():
             heavy = samples_by_rule(asked, displacement=float(asked.displacement[0]), wavelength=rings.wavelength) > 700
             if physics == "reference" or (heavy and method in ("matrix", "chirp_z", "fft", "rays")):
                 continue
-            if row.valid_for(asked) or (physics == "angular_spectrum" and spectrum_grids(asked)[0][0] > 1000):
+            if row.valid_for(asked) or (physics == "angular_spectrum" and spectrum_grids(asked)[0][0] > 600):
                 continue
             error, stated = rings.error(row(asked), image), row.error(asked)
             assert error <= 3 * max(stated, FLOOR), (seed, physics, method, error, stated)
