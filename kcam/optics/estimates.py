@@ -169,14 +169,14 @@ def _from_rim(distance: np.ndarray, r: np.ndarray, airy: float) -> np.ndarray:
 def _ring_error(query: Query, *, wavelength: float, period: float, captured: float) -> float:
     """What the structure of the radius scatters beyond the period, folded back: 2 Re(u* du) of the field in the window.
 
-    Its power spreads over the period's square; 100 times that (a fit), for it leaves out the outermost rings, which may
+    Its power spreads over the period's square; 400 times that (a fit), for it leaves out the outermost rings, which may
     be the finest.
     """
     if query.scatter is None:
         return 0.0
     scale = float(query.semi_aperture.detach()) / (wavelength * float(query.sensor_distance.detach()))
     share = float(query.scatter.share((period - query.half_window) * scale).max())
-    folded = 100 * share * min(1.0, 2 * query.half_window / period) ** 2 / captured
+    folded = 400 * share * min(1.0, 2 * query.half_window / period) ** 2 / captured
     return 2 * min(1.0, math.sqrt(folded))
 
 
