@@ -121,6 +121,11 @@ class Camera(nn.Module):
         An Imaging that absorbs the filter after it is one step, "Imaging + ColourFilter". Arguments: as `forward`.
         """
         if not isinstance(scene, (Scene, Tensor)):
+            if isinstance(scene, (list, tuple)) and any(isinstance(one, Scene) for one in scene):
+                raise TypeError(
+                    f"a camera takes one Scene, got {describe(scene)}. Use [camera(scene) for scene in scenes], or one "
+                    "Scene of a batch (B,3,H,W)."
+                )
             raise TypeError(
                 f"a camera takes a Scene or a tensor (B,L,H,W), got {describe(scene)}. Use "
                 "Scene.from_rgb(image, depth=2.0) or Scene.from_file(path, depth=2.0)."

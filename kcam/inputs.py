@@ -35,6 +35,8 @@ def check_floats(
     value: Any, *, name: str, takes: str, channels: Sequence[int] | None = (1, 3), ndims: Sequence[int] = (3, 4)
 ) -> None:
     """TypeError with the code that converts it, unless it is a floating-point tensor. `takes`: for the error."""
+    if isinstance(value, Tensor) and value.layout is not torch.strided:
+        raise TypeError(f"{name} must be a dense tensor {takes}, got {describe(value)}. Use {name}.to_dense().")
     if not isinstance(value, Tensor) or not value.is_floating_point():
         fix = remedy(value, name=name, channels=channels, ndims=ndims)
         raise TypeError(f"{name} must be a floating-point tensor {takes}, got {describe(value)}.{fix}")
@@ -175,7 +177,8 @@ def channels_last(shape: Sequence[int]) -> bool:
 def describe(value: Any) -> str:
     """What was given, in a few words."""
     if isinstance(value, Tensor):
-        return f"a tensor {tuple(value.shape)} of {value.dtype}"
+        sparse = "" if value.layout is torch.strided else "sparse "
+        return f"a {sparse}tensor {tuple(value.shape)} of {value.dtype}"
     if isinstance(value, np.ndarray):
         return f"an array {value.shape} of {value.dtype}"
     if isinstance(value, (list, tuple)):

@@ -35,6 +35,8 @@ FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
 
 def check_writable(path: str | os.PathLike[str], *, suffixes: Sequence[str] = PICTURE_SUFFIXES) -> None:
     """Fail before the work and not after it: ValueError for a suffix that cannot be written, or no place for it."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path must be the name of a file, got {type(path).__name__}. The picture comes first.")
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"cannot write {path.name}: its name must end in one of {', '.join(suffixes)}.")

@@ -10,6 +10,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from pathlib import Path
 from typing import TypeGuard
 
@@ -249,8 +250,10 @@ class Scene:
         """The picture that an ideal camera without lens would take, (B,3,H,W) sRGB clipped to [0,1], for looking at."""
         return linear_rgb_to_rgb(spectral.xyz_to_linear_srgb(self.xyz()).clamp(0, 1))
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Scene:
+    def to(self, device: torch.device | str | torch.dtype | None = None, dtype: torch.dtype | None = None) -> Scene:
         """The scene on another device or in another floating-point type. What is kept as float64 stays so."""
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
         return replace(self, coefficients=self.coefficients.to(device=device, dtype=dtype))
 
     def with_depth(self, depth: float | Tensor) -> Scene:
@@ -273,8 +276,8 @@ class Scene:
 
         Raises:    ValueError for a rank below 1. A rank above what the scene can have is that one.
         """
-        if rank < 1:
-            raise ValueError(f"rank must be at least 1, got {rank}.")
+        if not isinstance(rank, Integral) or rank < 1:
+            raise ValueError(f"rank must be at least 1, got {rank}. Use a whole number such as rank=3.")
         planes, spectra = self.coefficients, self.spectra
         flat = planes.detach().double().transpose(0, 1).flatten(1)
         gram = flat @ flat.T
@@ -297,6 +300,10 @@ class Scene:
     def crop(self, *, top: int, left: int, height: int, width: int) -> Scene:
         """A window of the scene, `height` x `width` pixels. Raises: ValueError unless it lies inside."""
         _, full_height, full_width = self.shape
+        if not all(isinstance(number, Integral) for number in (top, left, height, width)):
+            raise TypeError(
+                f"a window is of whole pixels, got {height} x {width} at row {top}, column {left}. Use int(...)."
+            )
         if not (0 <= top < top + height <= full_height and 0 <= left < left + width <= full_width):
             raise ValueError(
                 f"a window of {height} x {width} at row {top}, column {left} is not inside the scene's "

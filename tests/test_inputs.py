@@ -629,3 +629,56 @@ def test_imaging_takes_one_distance_of_a_plain_tensor() -> None:
         TypeError, match=r"distance must be one number of metres, got a tensor \(2,\).*Scene.from_bands"
     ):
         optics.Imaging(lens, distance=torch.tensor([1.0, 2.0]))
+
+
+# ---- lenses of a batch, and the rest of what was tried by hand ------------------------------------------------------
+
+LENSES = {"radii": 1 * mm, "wavelengths": [550e-9], "sensor_distance": 0.05, "pixel_pitch": 4 * um, "shape": (9, 9)}
+
+
+def test_lenses_of_a_batch_in_lists_and_arrays() -> None:
+    truth = optics.batch_psf(torch.tensor([0.0, 0.3]), **LENSES)
+    for given in ([0.0, 0.3], np.array([0.0, 0.3])):
+        torch.testing.assert_close(optics.batch_psf(given, **LENSES), truth, rtol=1e-5, atol=1e-7)
+    for radii in ([1 * mm, 1 * mm], np.full(2, 1 * mm), torch.tensor([1 * mm], dtype=torch.float64)):
+        found = optics.batch_psf([0.0, 0.3], **LENSES | {"radii": radii})
+        torch.testing.assert_close(found, truth, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("vergences", "changes", "error", "message"),
+    [
+        (0.0, {}, ValueError, r"must be finite, \(B,\).*Use torch.tensor\(\[0.0\]\)"),
+        (torch.tensor(0.0), {}, ValueError, r"must be finite, \(B,\).*Use torch.tensor\(\[0.0\]\)"),
+        ([0.0, np.nan], {}, ValueError, "vergences must be finite"),
+        ("far", {}, TypeError, "vergences must be .* got str 'far'"),
+        ([0.0, 1.0], {"radii": torch.full((3,), 1e-3)}, ValueError, r"radii must be a number or \(2,\), one per lens"),
+        ([0.0, 1.0], {"sensor_distance": [0.05] * 3}, ValueError, r"sensor_distance must be a number or \(2,\)"),
+        ([0.0, 1.0], {"shape": 9}, ValueError, r"two positive integers \(H, W\) in pixels, got 9"),
+        ([0.0, 1.0], {"coefficients": [0.0, 1e-7]}, ValueError, r"coefficients must be \(B, K\) with B = 2"),
+    ],
+)
+def test_lenses_that_cannot_be(vergences: Any, changes: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        optics.batch_psf(vergences, **LENSES | changes)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda x: Camera.ideal()([Scene.from_rgb(x)]), TypeError, r"\[camera\(scene\) for scene in scenes\]"),
+        (lambda x: plots.write_picture("a.png", x[0]), TypeError, "path must be .* The picture comes first"),
+        (lambda x: Scene.from_rgb(x.to_sparse()), TypeError, r"a sparse tensor .* Use image.to_dense\(\)"),
+        (lambda x: Scene.from_rgb(x).crop(top=0.5, left=0, height=4, width=4), TypeError, "of whole pixels, got 4 x 4"),
+        (lambda x: Scene.from_rgb(x).low_rank(1.5), ValueError, "got 1.5. Use a whole number such as rank=3"),
+        (lambda x: style.paint(style.StyleLoss(torch.rand(3, 64, 64), content=0), shape=256), TypeError, "shape=.256"),
+        (lambda x: style.fit(a_style(), Camera.ideal()), TypeError, "got StyleLoss and Camera. Use fit.camera"),
+    ],
+)
+def test_what_was_tried_by_hand(call: Callable[[Tensor], Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        call(torch.rand(2, 3, 9, 12))
+
+
+def test_a_scene_is_converted_as_a_tensor_is() -> None:
+    assert Scene.from_rgb(torch.rand(3, 4, 5)).to(torch.float64).dtype == torch.float64

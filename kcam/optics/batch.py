@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 import torch
 from scipy.special import fresnel
 from torch import Tensor
 
+from kcam.inputs import as_values, describe
 from kcam.optics import sampling
 from kcam.optics.autograd import once_differentiable
 from kcam.optics.elements import zernike_sum
@@ -59,18 +62,29 @@ def batch_psf(
     check_pixel_pitch(pixel_pitch)
     check_positive(radii, name="radii")
     check_positive(sensor_distance, name="sensor_distance")
-    device = vergences.device
-    residual = vergences.to(torch.float64)
+    given = as_values(vergences, name="vergences", unit="1/m")
+    if given.ndim not in (1, 2, 3) or not bool(given.isfinite().all()):
+        raise ValueError(
+            f"vergences must be finite, (B,), (B, Z) or (B, Z, {grid.numel()}) [1/m], got {describe(given)}"
+            f"{'' if given.ndim in (1, 2, 3) else '. Use torch.tensor([0.0]) for one lens in focus'}."
+        )
+    if not isinstance(shape, Sequence) or len(shape) != 2 or not all(isinstance(n, Integral) and n >= 1 for n in shape):
+        raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}. Use shape=(65, 65).")
+    device = given.device
+    residual = given.to(torch.float64)
     residual = residual[:, None] if residual.ndim == 1 else residual
     residual = residual[..., None] if residual.ndim == 2 else residual  # (B, Z, 1 or L)
     batch, layers = residual.shape[:2]
     if residual.ndim != 3 or residual.shape[2] not in (1, grid.numel()):
         raise ValueError(
-            f"vergences must be (B,), (B, Z) or (B, Z, {grid.numel()}), one per wavelength, got "
-            f"{tuple(vergences.shape)}."
+            f"vergences must be (B,), (B, Z) or (B, Z, {grid.numel()}), one per wavelength, got {tuple(given.shape)}."
         )
-    a = torch.as_tensor(radii, dtype=torch.float64, device=device).expand(batch)
-    d = torch.as_tensor(sensor_distance, dtype=torch.float64, device=device).expand(batch)
+    a, d = (
+        _one_each(value, batch, name=name).to(device)
+        for name, value in (("radii", radii), ("sensor_distance", sensor_distance))
+    )
+    if coefficients is not None:
+        coefficients = as_values(coefficients, name="coefficients", unit="m RMS")
     if coefficients is not None and (coefficients.ndim != 2 or coefficients.shape[0] != batch):
         raise ValueError(f"coefficients must be (B, K) with B = {batch}, got {tuple(coefficients.shape)}.")
     if batch == 0:
@@ -100,6 +114,14 @@ def batch_psf(
         for b in range(batch)
     ]  # fmt: skip
     return torch.stack(images)
+
+
+def _one_each(value: Tensor | float, batch: int, *, name: str) -> Tensor:
+    """One number for all lenses, or one for each, (B,) float64."""
+    values = as_values(value, name=name, unit="m").to(torch.float64)
+    if values.shape not in ((), (1,), (batch,)):
+        raise ValueError(f"{name} must be a number or ({batch},), one per lens, got shape {tuple(values.shape)}.")
+    return values.expand(batch)
 
 
 def _aberrated(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -54,6 +54,8 @@ def paint(
     start = start or ("noise" if photo is None else "photo")
     if start not in STARTS or (start == "photo" and photo is None):
         raise ValueError(f'start must be "photo", with a photo, or "noise"; got {start!r}.')
+    if shape is not None and (not isinstance(shape, Sequence) or len(shape) != 2):
+        raise TypeError(f"shape must be two whole numbers (H, W), got {shape!r}. Use shape=(256, 256).")
     if photo is None and shape is None:
         raise ValueError("a texture needs a size: pass shape=(256, 256), or a photo to paint.")
     if photo is None and (loss.weights["content"] or loss.weights["l2"]):

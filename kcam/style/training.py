@@ -80,6 +80,11 @@ def fit(
     Raises:    ValueError for a camera in which nothing trains, or a checkpoint of another run; TrainingError where the
                loss is not finite or diverges again and again.
     """
+    if not isinstance(camera, Camera) or not isinstance(loss, StyleLoss):
+        raise TypeError(
+            f"fit takes a Camera and a StyleLoss, got {type(camera).__name__} and {type(loss).__name__}. Use "
+            "fit(camera, StyleLoss(picture))."
+        )
     settings = settings or Settings()
     source = source or BuiltinScenes(settings.size)
     run = Run(camera, loss, source, settings, folder)
