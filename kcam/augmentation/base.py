@@ -31,8 +31,6 @@ RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
 TAKES = "(B,C,H,W), a picture in [0,1] or a cube"
 _LEAST, _LARGEST = -0.5, 2.5
 """Of a picture: some beyond 0 and 1 come from other augmentations; from here on it is another scale."""
-_NEGATIVE = 0.1
-"""Of the largest value of a cube: light is not negative but by interpolation and noise."""
 
 
 def is_picture(signal: Tensor) -> bool:
@@ -83,11 +81,8 @@ def check_probability(p: float) -> None:
         raise ValueError(f"p must be a probability from 0 to 1, got {p:g}.")
 
 
-def check_values(signal: Tensor, *, picture: bool, linear: bool = False) -> None:
-    """ValueError for NaN or infinity, which a blur would spread over all, and for a picture or cube on another scale.
-
-    linear: of a sensor, whose noise may lie as far below 0 as above.
-    """
+def check_values(signal: Tensor, *, picture: bool) -> None:
+    """ValueError for NaN or infinity, which a blur would spread over all, and for a picture on another scale."""
     if torch.compiler.is_compiling():
         return
     low, high = (float(value) for value in signal.detach().aminmax())
@@ -96,11 +91,6 @@ def check_values(signal: Tensor, *, picture: bool, linear: bool = False) -> None
     if picture and (high > _LARGEST or low < _LEAST):
         fix = scale_remedy(low, high, name="image")
         raise ValueError(f"the picture has values from {low:g} to {high:g}, expected sRGB in [0,1].{fix}")
-    if not (picture or linear) and low < min(_LEAST, -_NEGATIVE * high):
-        raise ValueError(
-            f"the cube has values from {low:g} to {high:g}, but light is not negative. Use image * std + mean if it is "
-            "normalised by mean and deviation, or image.clamp(min=0)."
-        )
 
 
 def check_layout(input: Tensor, *, wavelengths: Tensor | None = None, alpha: bool = False) -> None:
@@ -259,7 +249,7 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
 
     def _simulated(self, input: Tensor, drawn: dict[str, Tensor], *, linear: bool) -> Tensor:
         working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-        check_values(working, picture=is_picture(working) and not linear, linear=linear)
+        check_values(working, picture=is_picture(working) and not linear)
         with full_precision(input.device):
             coded = self.in_light and is_picture(working) and not linear
             result = self.simulate(to_light(working) if coded else working, drawn)
