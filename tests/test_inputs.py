@@ -23,7 +23,7 @@ from torch.autograd import forward_ad
 import kcam
 import kcam.augmentation as KC
 from kcam import Camera, Scene, isp, optics, plots, sensor, style
-from kcam.inputs import check_picture, describe
+from kcam.inputs import check_bands, check_picture, check_signal, describe
 from kcam.optics.imaging import alike
 from kcam.units import mm, um
 from tests.augmentation.augmented_cases import LENS, small_camera
@@ -398,15 +398,15 @@ def test_a_right_input_costs_a_look_at_its_type(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("kcam.inputs._code", lambda *given: pytest.fail("a remedy for what is right"))
     counts = []
     for call in (
-        lambda: Camera.ideal()(cube(1)),
-        lambda: KC.RandomExposure(p=1.0)(cube(1, 3)),
-        lambda: a_style()(torch.rand(1, 3, 64, 64), torch.rand(1, 3, 64, 64)),
+        lambda: check_signal(cube(1)),
+        lambda: check_bands(cube(1), name="image", count=28, ndims=(4,), sure=False),
         lambda: check_picture(cube(1, 3), name="image"),
+        lambda: KC.RandomExposure(p=1.0)(cube(1, 3)),
     ):
         read.clear()
         call()
         counts.append(len(read))
-    assert counts == [0, 1, 0, 1]
+    assert counts == [0, 0, 1, 1]
 
 
 # ---- distances ---------------------------------------------------------------------------------------------------

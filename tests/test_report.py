@@ -116,7 +116,7 @@ def test_a_sheet_takes_scenes_of_any_kind_and_leaves_the_random_state_alone() ->
 def test_no_scene_and_no_picture_say_so() -> None:
     with pytest.raises(ValueError, match="at least one scene"):
         report.style_sheet(Camera.ideal(), style=STYLE, scenes=[])
-    with pytest.raises(ValueError, match=r"Use picture\[0\]"):
+    with pytest.raises(ValueError, match=r"use picture\[0\]"):
         report.style_sheet(Camera.ideal(), style=STYLE[None], scenes=SCENES[:1])
 
 
