@@ -14,6 +14,7 @@ import math
 import pickle
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -229,7 +230,7 @@ def approaches_infinity(shot: Shot) -> None:
     """W20 = a^2 / 2z is 1e-2 waves at 100 m, and the raw is smooth in it: it comes closer at least as 1 / z."""
     distances = [10.0**power for power in range(2, 13)]
     with_inf = raw(shot, shot.scene)
-    errors = [relative(raw(shot, shot.scene.with_depth(distance)), with_inf) for distance in distances]
+    errors = [relative(raw(shot, replace(shot.scene, depth=distance)), with_inf) for distance in distances]
     print("1e2 .. 1e12 m against inf:", " ".join(f"{error:.0e}" for error in errors))
     floor = 3e-7  # of float32's FFTs, and a few steps of 24 bits
     assert errors[0] > 1e-5
