@@ -125,7 +125,8 @@ def survey(scene: Scene, camera: Camera, defocus: Defocus) -> list[Survey]:
     rows, columns = (-(-length // TILE) for length in planes.shape[2:])
     found = []
     for index, item in enumerate(planes):
-        depth = vergence[index] if vergence.ndim else vergence.expand(1, *item.shape[1:])
+        own_depth = vergence if vergence.ndim == 0 else vergence[index]  # a number for all, or each's own, or its map
+        depth = own_depth.expand(1, *item.shape[1:])
         far, near = _ends(depth, rows, columns)
         blur = torch.maximum(defocus.radius(far), defocus.radius(near))
         edge = defocus.spread * (_around(near) + _around(-far))

@@ -253,7 +253,9 @@ def _sample(
     else:
         part = [_rows(scene, [row]).crop(top=top, left=left, **size) for row, top, left in crops]
     maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
-    depth = torch.cat(maps) if maps else scene.depth
+    depth: float | Tensor = scene.depth
+    if isinstance(depth, Tensor):  # maps, or numbers of one per sample
+        depth = torch.cat(maps) if maps else torch.tensor([one.depth for one in part], dtype=torch.float64)
     together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
     owners = tuple(first + row for row, _, _ in crops)
     return Sample(together, owners, tuple(factors[row] for row, _, _ in crops))
