@@ -223,9 +223,9 @@ class Run:
             return
         if self.leads:  # what a plan chooses depends on how fast its machine is
             scenes = [self.source.draw([row], seed=self.settings.seed, step=self.step)[0] for row in range(2)]
-            with torch.no_grad():
-                plan = self.plan
-                if plan is None or max(plan.measure(self.camera, scene) for scene in scenes) > tolerance:
+            plan = self.plan
+            if plan is None or max(plan.measure(self.camera, scene) for scene in scenes) > tolerance:
+                with torch.enable_grad():  # the plan is trained through: it holds gradients to the tolerance too
                     self.plan = self.camera.plan(scenes, tolerance=tolerance)
         self.plan = told_by_the_first(self.plan, self.world)
         self._use_plan(self.plan)

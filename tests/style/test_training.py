@@ -321,6 +321,7 @@ def test_recorded_is_what_the_sensor_sees_with_and_without_optics() -> None:
 def test_a_plan_is_frozen_and_kept(tmp_path: Path) -> None:
     trained = train(None, tolerance=0.02)
     assert trained.plan is not None
+    assert trained.plan.gradients
     reference = train(None)
     assert not torch.equal(trained.history, reference.history)
     assert torch.allclose(trained.history[0], reference.history[0], rtol=0.05)
