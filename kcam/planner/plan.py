@@ -104,8 +104,8 @@ class Range:
             contrast=math.sqrt(float(potential[:, NEIGHBOURS].max())),
             wavelengths=tuple(scenes[0].wavelengths.tolist()),
             potential=tuple(potential.amax(0).tolist()),
-            light=tuple(_shares(light).amax(0).tolist()),
-            depths=tuple(_shares(depths).amax(0).tolist()),
+            light=tuple(shares(light).amax(0).tolist()),
+            depths=tuple(shares(depths).amax(0).tolist()),
             saturated=float(potential[:, -1].min()),
             darkest=min((found.level for found in surveys), default=0.0),
             brightest=max((found.level for found in surveys), default=0.0),
@@ -124,9 +124,9 @@ class Range:
             if depth or kind not in OF_DEPTH:
                 yield kind, hidden * math.sqrt((ours + LEAST) / (planned + LEAST))
         if depth:
-            share, known = _shares(found.depths), torch.tensor(self.depths).to(found.depths)
+            share, known = shares(found.depths), torch.tensor(self.depths).to(found.depths)
             yield "light at some distances", float(((share + DEPTH) / (known + DEPTH)).max()) ** 2 / OTHER_LIGHT
-        light, known = _shares(found.light), torch.tensor(self.light).to(found.light)
+        light, known = shares(found.light), torch.tensor(self.light).to(found.light)
         ratios = (light + COLOUR) / (known + COLOUR)
         band = int(ratios.argmax())
         yield f"share of light at {self.wavelengths[band] * 1e9:.0f} nm", float(ratios[band]) ** 2 / OTHER_LIGHT
@@ -370,7 +370,7 @@ def relative_rms(a: Tensor, b: Tensor) -> float:
     return float((a - b).square().mean().sqrt() / b.square().mean().sqrt().clamp(min=1e-30))
 
 
-def _shares(values: Tensor) -> Tensor:
+def shares(values: Tensor) -> Tensor:
     """Of the root of the sum of squares."""
     return values / values.norm(dim=-1, keepdim=True).clamp(min=1e-30)
 

@@ -27,7 +27,17 @@ from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import Imaging
-from kcam.planner.plan import ENDS, noiseless_raw, relative_rms, shortened, with_imaging
+from kcam.planner.plan import (
+    COLOUR,
+    DEPTH,
+    ENDS,
+    OTHER_LIGHT,
+    noiseless_raw,
+    relative_rms,
+    shares,
+    shortened,
+    with_imaging,
+)
 from kcam.planner.survey import KINDS, TILE, Defocus, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
@@ -190,7 +200,9 @@ def _samples(
     scenes: Sequence[Scene], surveys: Sequence[Sequence[Survey]], *, pixels: int, side: int | None = None
 ) -> list[Sample]:
     """What choices are tried on: all that there is while it has not more than so many pixels; else the scenes with the
-    largest potential of each kind, relative to what is recorded of them, and others as they come closest to those.
+    largest potential of each kind, relative to what is recorded of them, those of light or distances that none of
+    these has, for potentials do not tell how wrong a choice is at one wavelength or distance, and others as they come
+    closest to the first.
 
     side: of the crops that are made of a single scene with more than so many pixels; None: so that they have as many.
     """
@@ -201,6 +213,10 @@ def _samples(
     score = (relative / relative.amax(0).clamp(min=1e-30)).amax(1)
     sizes = [scenes[index].shape[1] * scenes[index].shape[2] for index, _ in every]
     chosen = list(dict.fromkeys(relative.argmax(0).tolist()))
+    for kind, least in (("light", COLOUR), ("depths", DEPTH)):
+        own = shares(torch.stack([getattr(surveys[index][row], kind) for index, row in every])) + least
+        while float((more := (own / own[chosen].amax(0)).amax(1)).max()) > math.sqrt(OTHER_LIGHT):
+            chosen.append(int(more.argmax()))
     for other in score.argsort(descending=True, stable=True).tolist():
         if other not in chosen and sum(sizes[k] for k in chosen) + sizes[other] <= pixels:
             chosen.append(other)
@@ -244,8 +260,8 @@ def _sample(
                 left, of_columns = _window(tile[1], kind.shape[1], extent, width)
                 seen |= of_rows[:, None] & of_columns
                 crops.append((row, top, left))
-        shares = [float(kind[seen].sum() / kind.sum()) for kind in kinds if kind.any()]
-        factors[row] = math.sqrt(shares[-1] / min(shares)) if shares else 1.0
+        covered = [float(kind[seen].sum() / kind.sum()) for kind in kinds if kind.any()]
+        factors[row] = math.sqrt(covered[-1] / min(covered)) if covered else 1.0
     size = {"height": min(extent, height), "width": min(extent, width)}
     if height * width <= pixels or len(rows) * height * width <= len(crops) * size["height"] * size["width"]:
         part = [_rows(scene, [row]) for row in rows]

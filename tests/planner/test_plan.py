@@ -178,6 +178,34 @@ def test_hard_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> None:
     assert_inside(shot, light, (0.03, 0.003), text)
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One item in light of one wavelength, of less contrast than the others, and another one that is nearer; not all
+    can be tried."""
+    monkeypatch.setattr(trials, "LARGEST", 48**2)
+    monkeypatch.setattr(trials, "WITNESSED", 4 * 48**2)
+    draw, grid = random.Random(seed), wavelength_grid()
+    count, line = 8, draw.choice([1, 2, 3, 5, 8, 25])
+    coloured, near = draw.sample(range(count), 2)
+    picture = Scene.builtin("coffee", (48, 48)).coefficients.mean(1)
+    planes = torch.zeros(count, 2, 48, 48)
+    for item in range(count):
+        share = 0.6 if item in (coloured, near) else 1.0
+        planes[item, int(item == coloured)] = share * picture.roll(5 * item, -1) + (1 - share) * picture.mean()
+    spectra = torch.ones(2, len(grid))
+    spectra[1] = 10.0 * (torch.arange(len(grid)) == line)
+    depth = torch.full((count,), 2.0, dtype=torch.float64)
+    depth[near] = 0.9
+    light, shot = Scene(planes, spectra, grid, depth), camera(diameter=5 * mm)
+    with torch.no_grad():
+        owners = {owner for sample in Planner(shot, light).trials.witnesses for owner in sample.owners}
+    assert {coloured, near} <= owners
+    assert len(owners) < count
+    assert_inside(shot, light, (0.05, 0.02, 0.005))
+
+
 @pytest.mark.parametrize("seed", [30, 31])
 def test_crops_stand_for_a_picture_whose_last_trial_cannot_see_it_whole(
     seed: int, monkeypatch: pytest.MonkeyPatch
