@@ -116,7 +116,7 @@ def test_no_print_no_assert_no_bare_raise(path: Path) -> None:
 )
 def test_nothing_that_is_not_compiled_waits_for_the_compiler(code: str) -> None:
     """torch._dynamo takes 2 s to import, and torch.compiler's own decorators do so."""
-    late = ("torch._dynamo", "torch._inductor", "matplotlib", "cv2", "h5py", "colour")
+    late = ("torch._dynamo", "torch._inductor", "sympy", "matplotlib", "cv2", "h5py", "colour")
     code += f"; import sys; print([name for name in {late} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

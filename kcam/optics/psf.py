@@ -216,8 +216,7 @@ def residual_path(query: Query, pupil: Pupil, elements: Sequence[Element] | None
 
 
 def _stacked(maps: Sequence[Tensor]) -> Tensor:
-    shape = torch.broadcast_shapes(*(m.shape for m in maps))
-    return torch.stack([m.expand(shape) for m in maps])
+    return torch.stack(torch.broadcast_tensors(*maps))
 
 
 def _outermost(query: Query) -> Query:

@@ -21,6 +21,8 @@ _MOST_PANELS = 2**14
 _FINEST = 2.0**-26  # width of a panel around a step that no panel resolves: of no weight any more
 _RESOLVED = 1e-6  # of the highest Legendre coefficients of a phase in a panel [rad]
 _CHECKED = 16  # nodes by which a panel is judged
+_LOOKED_AT = 2**16  # places along the radius at which narrow structure is looked for
+_BEND = 1e-3  # between three of these: what is bent more, nodes of a wide panel may not see [rad]
 _MOST_SPECTRUM = 2**17  # samples of a radius
 
 
@@ -39,15 +41,22 @@ def panels_of(phase: Callable[[Tensor], Tensor], knots: Tensor, *, first: int = 
 
     Args:      phase: (n,) radii to (..., n) [rad]. knots: where it is known not to be smooth, in [0, 1].
                first: equal panels to begin with.
-    Returns:   (K,) ascending from 0 to 1. A step is closed in on to 2^-26 of the radius.
+    Returns:   (K,) ascending from 0 to 1. A step is closed in on to 2^-26 of the radius; a groove narrower than 2^-16
+               of it may be missed.
     Raises:    ValueError for a phase that more than 2^14 panels do not resolve.
     """
     places, weights = legendre(_CHECKED)
-    series = np.polynomial.legendre.legvander(places, _CHECKED - 1)[:, -4:] * weights[:, None] * (_CHECKED - 2.5)
-    last, nodes = torch.as_tensor(series).to(knots), torch.as_tensor(places).to(knots)
+    orders = np.arange(_CHECKED)
+    series = np.polynomial.legendre.legvander(places, _CHECKED - 1) * weights[:, None] * (orders + 0.5)
+    at_ends = np.vstack([series @ np.stack([(-1.0) ** orders, 1.0**orders], axis=1), -np.eye(2)])
+    judged = np.hstack([np.vstack([series[:, -4:], np.zeros((2, 4))]), 1e-2 * at_ends])  # ends: to 1e-4 rad
+    last, nodes = torch.as_tensor(judged).to(knots), torch.as_tensor(places).to(knots)
     equal = torch.linspace(0, 1, first + 1, dtype=knots.dtype, device=knots.device)
     edges = torch.cat([equal, knots]).unique()
     low, high = edges[:-1], edges[1:]
+    looked_at = torch.linspace(0, 1, _LOOKED_AT + 1, dtype=knots.dtype, device=knots.device)
+    bends = phase(looked_at).diff(n=2).abs().flatten(0, -2).amax(0) > _BEND
+    bends = looked_at[1:-1][bends]  # one groove in a wide panel may lie between its nodes
     while low.numel():
         if edges.numel() > _MOST_PANELS:
             raise ValueError(
@@ -55,8 +64,11 @@ def panels_of(phase: Callable[[Tensor], Tensor], knots: Tensor, *, first: int = 
                 "its element name the radii between which it is, as `knots`, or make its structure coarser."
             )
         centre, half = (low + high) / 2, (high - low) / 2
-        values = phase((centre[:, None] + half[:, None] * nodes).flatten()).unflatten(-1, (-1, _CHECKED))
+        inside = centre[:, None] + half[:, None] * nodes
+        seen = torch.cat([inside, low[:, None] + _FINEST / 4, high[:, None] - _FINEST / 4], dim=1)
+        values = phase(seen.flatten()).unflatten(-1, (-1, _CHECKED + 2))
         rough = ((values @ last).abs().amax(-1) > _RESOLVED).flatten(0, -2).any(0) & (2 * half > _FINEST)
+        rough |= (torch.searchsorted(bends, low) < torch.searchsorted(bends, high)) & (2 * half > 16 / _LOOKED_AT)
         low, high, centre = low[rough], high[rough], centre[rough]
         edges = torch.cat([edges, centre])
         low, high = torch.cat([low, centre]), torch.cat([centre, high])

@@ -29,15 +29,13 @@ Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost tw
 def fast_length(minimum: int) -> int:
     """The smallest length >= `minimum` that FFTs like: no prime factor above 7, a multiple of 32 from 256 up."""
     step = 32 if minimum >= 256 else 2 if minimum > 2 else 1
-    length = math.ceil(minimum / step) * step
-    while True:
-        rest = length
-        for factor in (2, 3, 5, 7):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return length
-        length += step
+    steps = max(1, math.ceil(minimum / step))
+    odd = [1]  # a power of two is below 2 * steps, so nothing beyond that is shortest
+    for factor in (3, 5, 7):
+        for known in odd:  # grows meanwhile, by all powers of the factor
+            if known * factor < 2 * steps:
+                odd.append(known * factor)
+    return step * min(known << (math.ceil(steps / known) - 1).bit_length() for known in odd)
 
 
 class Transform(Protocol):

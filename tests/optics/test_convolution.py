@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -146,3 +148,20 @@ def test_kappa_sets_the_pupil_sampling() -> None:
 def test_bad_shortcuts_say_what_is_wrong(arguments: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text.replace("(", r"\(")):
         imaging(**arguments)
+
+
+@pytest.mark.parametrize("span", [range(1, 1200), range(99_000, 99_100)], ids=["short", "long"])
+def test_fast_lengths_are_the_shortest(span: range) -> None:
+    from kcam.optics.transforms import fast_length
+
+    def smooth(n: int) -> bool:
+        for factor in (2, 3, 5, 7):
+            while n % factor == 0:
+                n //= factor
+        return n == 1
+
+    for least in span:
+        step = 32 if least >= 256 else 2 if least > 2 else 1
+        candidates = range(math.ceil(least / step) * step, 4 * least + 4, step)
+        assert fast_length(least) == next(n for n in candidates if smooth(n))
+    assert 10**15 < fast_length(10**15 + 1) < 1.001e15  # by products, not by trying

@@ -346,6 +346,22 @@ def test_a_subclass_with_terms_of_its_own_tells_nothing_until_it_says_so() -> No
     assert not optics.Lens(optics.CircularAperture(1 * mm), optics.ThinLens(50 * mm), focus_distance=2.0).has_rings
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_a_lone_groove_is_found_wherever_it_is(seed: int) -> None:
+    """Also between the nodes of the first panels, and at their ends."""
+    rng = random.Random(seed)
+    width = log_uniform(rng, 3e-5, 1e-2)
+    first = rng.choice([rng.uniform(0, 0.99), rng.randrange(32) / 32 + rng.choice([1e-4, 1e-6]), 0.5 - width / 2])
+    knot = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    flat = panels_of(lambda rho: 3.0 * ((rho >= first) & (rho < first + width)).to(rho)[None], knot)
+    for edge in (first, first + width):
+        assert float((flat - edge).abs().min()) < 2**-25
+    smooth = panels_of(lambda rho: torch.exp(-(((rho - first) / width) ** 2))[None], knot)
+    widths = smooth.diff()[(smooth[1:] > first - width) & (smooth[:-1] < first + width)]
+    assert float(widths.max()) < 4 * width
+    assert smooth.numel() < 200
+
+
 def test_panels_close_in_on_a_step() -> None:
     edges = panels_of(lambda rho: (rho > 0.3).to(rho)[None], torch.tensor([0.0, 1.0], dtype=torch.float64))
     assert float((edges - 0.3).abs().min()) < 2**-25
