@@ -269,9 +269,12 @@ def explain(
     with one_line_errors():
         import torch
 
-        from kcam import planner
+        from kcam import files, planner
         from kcam.scene import BUILTIN, Scene
 
+        if out is not None:
+            files.check_place(out)
+            files.check_other(out, photo)
         stages = open_camera(camera)
         if photo in BUILTIN:
             scene = Scene.builtin(photo, size or None)

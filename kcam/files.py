@@ -95,7 +95,8 @@ def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[st
                version: of kcam, for the reader's information.
     Raises:    TypeError for an argument that cannot be written or that its class does not keep;
                ValueError for a name that does not end in .safetensors, or is a folder's, and for a layer of torch's
-               that is not among `kcam.layers.NAMES` or was changed after it was made;
+               that is not among `kcam.layers.NAMES`, was changed after it was made, or is subclassed without a
+               constructor of its own;
                FileNotFoundError if the folder does not exist.
     """
     path = Path(path)
@@ -335,11 +336,18 @@ def _arguments(value: Any) -> dict[str, Any]:
     """The constructor arguments that would build this object again."""
     if hasattr(value, "configuration"):
         return value.configuration()
+    cls = type(value)
+    start: Any = cls.__init__
+    if start is not nn.Module.__init__ and start.__module__.partition(".")[0] == "torch":
+        raise ValueError(
+            f"cannot save a {cls.__qualname__}: it inherits the constructor of {start.__qualname__.partition('.')[0]}. "
+            "Give it an __init__ of its own, whose arguments it stores as attributes of the same names."
+        )
     arguments = {}
-    for name in _constructor(type(value)):
+    for name in _constructor(cls):
         if not hasattr(value, name):
             raise TypeError(
-                f"cannot save {type(value).__qualname__}({name}=): the module does not keep it. Store every "
+                f"cannot save {cls.__qualname__}({name}=): the module does not keep it. Store every "
                 f"constructor argument as an attribute of the same name: self.{name} = {name}."
             )
         argument = getattr(value, name)
@@ -372,6 +380,14 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"format {FORMAT}. Update kcam."
         )
     return from_json(metadata["kcam"], _Document, wrong=damaged, fix=FIX, hook=None), tensors
+
+
+def check_place(path: Path) -> None:
+    """ValueError where no file of that name can be: where there is a folder, or none to put it into."""
+    if path.is_dir():
+        raise ValueError(f"cannot write {path.name}: there is a folder of that name. Choose another name.")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"cannot write {path.name}: there is no folder {path.parent}.")
 
 
 def check_other(path: str | os.PathLike[str], given: str | os.PathLike[str] | None) -> None:

@@ -44,7 +44,7 @@ def arguments(layer: nn.Module) -> dict[str, Any]:
     """The constructor arguments that would build a layer again; of a Sequential its layers by name.
 
     Raises:    ValueError that names it, for a class that is not in the table, and for a layer to which something was
-               done that its arguments do not tell: hooks, other weights, a forward of its own.
+               done that its arguments do not tell: hooks, other weights, layers or settings, a forward of its own.
     """
     cls = type(layer)
     if cls not in KINDS:
@@ -60,15 +60,16 @@ def arguments(layer: nn.Module) -> dict[str, Any]:
         if "bias" in found:
             found["bias"] = found["bias"] is not None
     changed = bool(layer._forward_hooks or layer._forward_pre_hooks or "forward" in vars(layer))
-    if cls is not nn.Sequential:
-        try:
-            changed |= _shapes(empty(cls, found)) != _shapes(layer)
-        except Exception:  # what its attributes say cannot be built any more
-            changed = True
+    try:
+        again = empty(cls, found)
+        changed |= _shapes(again) != _shapes(layer) or again._modules.keys() != layer._modules.keys()
+        changed |= any(vars(layer).get(name) != value for name, value in _settings(again).items())
+    except Exception:  # what its attributes say cannot be built any more
+        changed = True
     if changed:
         raise ValueError(
             f"cannot save a {_full_name(cls)} to which something was done after it was made (a hook, a normalisation "
-            "of its weights, a forward of its own). Put it into a class of your own, and load it with "
+            "of its weights, another setting, a forward of its own). Put it into a class of your own, and load it with "
             "Camera.load(path, custom=[...])."
         )
     return found
@@ -108,6 +109,12 @@ def _parameters(cls: type[nn.Module]) -> list[str]:
 
 def _shapes(layer: nn.Module) -> dict[str, tuple[bool, tuple[int, ...]]]:
     return {name: (isinstance(t, nn.Parameter), tuple(t.shape)) for name, t in tensors(layer).items()}
+
+
+def _settings(layer: nn.Module) -> dict[str, Any]:
+    """What a constructor leaves beside tensors and layers, what it derives from its arguments too."""
+    apart = vars(nn.Module()).keys()
+    return {name: value for name, value in vars(layer).items() if name not in apart}
 
 
 def _listed(shapes: Mapping[str, tuple[bool, tuple[int, ...]]]) -> str:

@@ -40,10 +40,7 @@ def check_writable(path: str | os.PathLike[str], *, suffixes: Sequence[str] = PI
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"cannot write {path.name}: its name must end in one of {', '.join(suffixes)}.")
-    if path.is_dir():
-        raise ValueError(f"cannot write {path.name}: there is a folder of that name. Choose another name.")
-    if not path.absolute().parent.is_dir():
-        raise ValueError(f"cannot write {path.name}: there is no folder {path.parent}.")
+    files.check_place(path)
 
 
 def write_picture(picture: Tensor, path: str | os.PathLike[str], *, quality: int = 95) -> None:

@@ -127,6 +127,9 @@ def test_explain(photo: Path, tmp_path: Path) -> None:
     assert "2.1" in run("explain", "motorcycle", "--size", 32, "--tolerance", "sensor").splitlines()[0]
     assert "there is no file" in fails("explain", tmp_path / "nothing.png")
     assert "unknown camera" in fails("explain", photo, "--camera", "pinhole")
+    assert "there is no folder" in fails("explain", photo, "--out", tmp_path / "no" / "plan.json")
+    assert "there is a folder of that name" in fails("explain", photo, "--out", tmp_path)
+    assert "is what is read" in fails("explain", photo, "--out", photo)
 
 
 @pytest.mark.slow

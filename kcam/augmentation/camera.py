@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,9 +110,9 @@ class RandomCamera(CameraAugmentation):
             scene = Scene.builtin(_SCENE, shape, wavelengths=bands).to(device=signal.device)
             if nearest is not None:
                 ramp = torch.linspace(far, near, shape[1], dtype=torch.float64).clamp(min=LEAST_VERGENCE)
-                scenes = [scene.with_depth((1 / ramp).expand(1, 1, *shape).to(signal.device))]
+                scenes = [replace(scene, depth=(1 / ramp).expand(1, 1, *shape).to(signal.device))]
             else:
-                scenes = [scene.with_depth(1 / max(end, LEAST_VERGENCE)) for end in {near, far}]
+                scenes = [replace(scene, depth=1 / max(end, LEAST_VERGENCE)) for end in {near, far}]
             plan = camera.plan(scenes, tolerance=self.tolerance)
             # a plain camera: a PlannedCamera would warn of each picture that is not like the fixed scene
             self._planned[key] = settings, Camera(*plan.apply(camera), context=camera.resolve())
@@ -146,8 +147,10 @@ class RandomCamera(CameraAugmentation):
 
     def _scene(self, row: Tensor, depth: float | Tensor) -> Scene:
         if is_picture(row):
-            return Scene.from_rgb(clip_ste(row, 0.0, 1.0), depth=depth)
-        return Scene.from_bands(clip_ste(row, 0.0, None), wavelengths=self._bands(row), depth=depth)
+            scene = Scene.from_rgb(clip_ste(row, 0.0, 1.0))
+        else:
+            scene = Scene.from_bands(clip_ste(row, 0.0, None), wavelengths=self._bands(row))
+        return replace(scene, depth=depth)  # of a distance that was drawn nobody asks whether millimetres were meant
 
 
 def _opened(camera: str | os.PathLike[str] | Camera) -> Camera:

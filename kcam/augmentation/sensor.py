@@ -13,7 +13,7 @@ from kcam.camera import Camera
 from kcam.context import Context
 from kcam.isp import ColourMatrix, Demosaic, ToneCurve, WhiteBalance, demosaic
 from kcam.sensor import ColourFilter, Exposure, Mosaic, mosaic, quantise, read_noise, shot_noise
-from kcam.sensor.noise import fixed_pattern
+from kcam.sensor.noise import MOST_PRNU, fixed_pattern
 from kcam.ste import clip_ste
 from kcam.units import check_positive, wavelength_grid
 
@@ -133,7 +133,8 @@ class RandomFixedPattern(CameraAugmentation):
 
     In `K.VideoSequential` the frames of a clip share their sensor.
 
-    Args:      prnu: relative spread of the gain. dsnu: spread of the offset [electrons]. full_well: [electrons].
+    Args:      prnu: relative spread of the gain, 0 to 0.5 (0.01 is 1 %). dsnu: spread of the offset [electrons].
+               full_well: [electrons].
     """
 
     def __init__(
@@ -148,7 +149,7 @@ class RandomFixedPattern(CameraAugmentation):
     ) -> None:
         check_positive(full_well, name="full_well", unit="electrons")
         draws: dict[str, Draw] = {
-            "prnu": Uniform(prnu, least=0.0),
+            "prnu": Uniform(prnu, least=0.0, most=MOST_PRNU, unit="(a share: 0.01 is 1 %)"),
             "dsnu": Uniform(dsnu, least=0.0, unit="[electrons]"),
             "sensor_seed": Seed(),
         }

@@ -299,9 +299,8 @@ def _check_is_depth(mask: Any) -> None:
 
 def _scene(bands: Tensor, depth: Tensor, context: Context) -> Scene:
     light = "D65" if context.illuminant is None else context.illuminant
-    return Scene.from_bands(
-        bands, wavelengths=context.wavelengths, depth=1 / finite_vergence(depth, bands), illuminant=light
-    )
+    scene = Scene.from_bands(bands, wavelengths=context.wavelengths, illuminant=light)
+    return dataclasses.replace(scene, depth=1 / finite_vergence(depth, bands))
 
 
 def _flat(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:

@@ -39,6 +39,9 @@ INFRARED_EDGE = 8 * nm
 SHARPNESS = 10.0
 """Of the learned tile's softplus: alpha = softplus(10 x) / 10 is about x above 0.2, and its slope at 0.01 is 0.1."""
 
+_REACH = math.exp(-2.0)
+"""Of a Gaussian's peak: where it is less at every wavelength of a curve, the curve says nothing of it."""
+
 LEAST_ALPHA = 0.01
 """What a learned tile starts from where the curve is 0."""
 
@@ -76,7 +79,8 @@ def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
 
     Args:      curves: (C, L), in any scale.  wavelengths: (L,), equally spaced [m].
     Returns:   coefficients in float64, scaled so that green (channel 1, or the only one) peaks at exactly 1. What they
-               are held to are the curves over their own green's peak, so a factor in the curves changes nothing.
+               are held to are the curves over their own green's peak, so a factor in the curves changes nothing. Of a
+               Gaussian farther than two widths from all wavelengths nothing is known: its coefficient is 0.
     Raises:    ValueError for wavelengths out of range, curves of another shape or not finite, and a green that is 0,
                or that the Gaussians, centred between 420 and 720 nm, do not reach.
     Source:    Lawson and Hanson, Solving Least Squares Problems (1974), chapter 23: NNLS, as in scipy.
@@ -98,7 +102,10 @@ def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
 
     def fit(width: float) -> GaussianFit:
         basis = gaussian_basis(grid, width=width)
-        alpha = torch.stack([torch.from_numpy(nnls(basis.T.numpy(), curve)[0]) for curve in given.numpy()])
+        alpha = torch.zeros(len(given), BASIS_SIZE, dtype=torch.float64)
+        reached = basis.amax(1) >= _REACH * basis.max()
+        for row, curve in zip(alpha, given.numpy(), strict=True):
+            row[reached] = torch.from_numpy(nnls(basis[reached].T.numpy(), curve)[0])
         alpha = alpha / (alpha @ basis)[green].max()
         return GaussianFit(alpha, width, tuple((alpha @ basis - given).square().mean(1).sqrt().tolist()))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import math
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 import kcam.augmentation as KC
+from kcam import Camera
 
 
 def table(wanted: Callable[[Case], bool] = lambda case: True) -> pytest.MarkDecorator:
@@ -709,6 +711,7 @@ class TestCompile:
         (lambda: KC.RandomShotReadNoise(iso=(0.0, 100.0)), ValueError, r"iso must be .*\(100 is base\)"),
         (lambda: KC.RandomShotReadNoise(read_noise=-1.0), ValueError, r"read_noise must be .*\[electrons\]"),
         (lambda: KC.RandomFixedPattern(prnu=-0.1), ValueError, "prnu must be"),
+        (lambda: KC.RandomFixedPattern(prnu=(0, 6)), ValueError, r"prnu must be .* share: 0.01 is 1 %.* <= 0.5"),
         (lambda: KC.RandomFixedPattern(full_well=0.0), ValueError, "full_well"),
         (lambda: KC.RandomExposure(stops=(1.0, 2.0, 3.0)), ValueError, r"stops must be .*got shape \(3,\)"),
         (lambda: KC.RandomExposure(stops=nn.Parameter(torch.tensor(1.0))), ValueError, r"parameter must be \(2,\)"),
@@ -781,6 +784,19 @@ class TestDepth:
             y, expected = (seeded(augment, x, inverse_depth=depth) for augment in (planned, exact))
             assert (y - expected).abs().mean() < 0.02
         assert len(planned._planned) == 3  # of the range, up to 8 and up to 4 per metre: not one for each map
+
+    @pytest.mark.parametrize("tolerance", [0, 0.05])
+    def test_nobody_asks_whether_what_was_drawn_far_away_was_in_millimetres(self, tolerance: float) -> None:
+        """Warnings are errors here: of a sky in a map, and of distances up to infinity, there were some."""
+        x = picture(1, 3, *SIZE)
+        for distance in ((400.0, 500.0), (0.5, math.inf), math.inf):
+            KC.RandomCamera(distance=distance, tolerance=tolerance, p=1.0)(x)
+        camera = KC.RandomCamera(tolerance=tolerance, p=1.0)
+        for vergence in (0.0, 1 / 500):
+            far = torch.full((1, 1, *SIZE), vergence)
+            KC.CameraSequential(camera, data_keys=["input", "mask"])(x, far)
+            imaging = Camera.phone()[0]
+            KC.CameraSequential(imaging, data_keys=["input", "mask"])(picture(1, 28, *SIZE), far)
 
     @pytest.mark.parametrize("name", ["defocus", "camera"])
     def test_rows_and_replay(self, name: str) -> None:

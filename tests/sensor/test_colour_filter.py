@@ -69,6 +69,21 @@ def test_a_fit_does_not_depend_on_the_scale_of_its_curves(seed):
     assert math.hypot(*one.errors) <= 1.5 * min(residuals) / math.sqrt(len(FINE)) + 1e-6
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_fit_says_nothing_of_light_that_its_curves_do_not_reach(seed):
+    """Random curves on random short or coarse grids: a Gaussian that is far from all of it had 1e52 once."""
+    generator = torch.Generator().manual_seed(seed)
+    first = float(400 + 300 * torch.rand((), generator=generator))
+    count = int(torch.randint(1, 12, (), generator=generator))
+    step = float(1 + 30 * torch.rand((), generator=generator))
+    grid = (first + step * torch.arange(count, dtype=torch.float64))[: max(1, int((760 - first) / step))] * nm
+    curves = 0.1 + torch.rand(3, len(grid), generator=generator, dtype=torch.float64)
+    fit = fit_gaussians(curves, wavelengths=grid)
+    far = (torch.linspace(420, 720, 12, dtype=torch.float64)[:, None] * nm - grid).abs().amin(1) > 60 * nm
+    assert float(fit.coefficients[:, far].sum()) == 0
+    assert 0 < float(fit.coefficients.max()) < 100
+
+
 @pytest.mark.parametrize(
     ("curves", "wavelengths", "text"),
     [
