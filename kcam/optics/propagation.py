@@ -82,7 +82,7 @@ class Propagator(nn.Module):
     def model_error(self, query: Query) -> float:
         """Estimated L1 error of the reference itself against Rayleigh-Sommerfeld, over the window of the query.
 
-        Never more than 3 times too small (above 1e-6) nor 40 times too large over random lenses, round, annular and
+        Never more than 4 times too small (above 1e-6) nor 40 times too large over random lenses, round, annular and
         coded, in focus and out; right in their median. See `estimates.debye_error`.
         """
         return min(2.0, max(debye_error(query, rays) for rays in trace(query)))

@@ -290,7 +290,7 @@ def colour_scene(draw: Draw, size: int = 32) -> tuple[str, Scene]:
     return kind, Scene.from_rgb(picture, depth=1 / places)
 
 
-COVERAGE = {"ideal": 0.06, "singlet": 0.25, "rough": 0.25}
+COVERAGE = {"ideal": 0.06, "singlet": 0.3, "rough": 0.3}
 
 
 def check_coverage(seed: int, lens: str) -> None:
