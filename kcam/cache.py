@@ -13,7 +13,7 @@ modules of all other classes, whose methods may read a global, a closure or a fi
 do not, see `optics.Element`. Nor is anything kept or used that a derivative passes through: of a graph, of forward
 mode, or of a transform of `torch.func`.
 
-Left to whoever does so: changing kcam's classes, functions and constants themselves.
+Left to whoever does so: changing kcam's functions and constants themselves.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ def _ours(cls: type) -> bool:
 
 
 def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
-    """Code, by identity, and data that instances have from classes of others, which must promise: see `Element`."""
-    code: list[Any] = []
+    """Code, by identity, and data that instances have from classes: those of others must promise, see `Element`."""
+    code: list[Any] = [tuple(vars(cls).values()) for cls in kind.__mro__ if _ours(cls)]
     data: list[Any] = []
     others = [cls for cls in kind.__mro__[:-1] if not _ours(cls)]
     if others and vars(kind).get("pure") is not True:
@@ -109,9 +109,19 @@ def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
         for name, value in vars(cls).items():
             if isinstance(value, _CODE):
                 code.append(value)
+                for function in (value, *(getattr(value, of, None) for of in ("__func__", "fget"))):
+                    if isinstance(function, types.FunctionType):
+                        code.append(function.__code__)
+                        data += [function.__defaults__, function.__kwdefaults__, *_closed_over(function)]
             elif not name.startswith("__"):
                 data += [name, value]
     return code, data
+
+
+def _closed_over(function: types.FunctionType) -> list[Any]:
+    """What a function closed over, but for its class, which super() needs."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    return [cell.cell_contents for name, cell in cells if name != "__class__"]
 
 
 class Settings:

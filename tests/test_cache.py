@@ -671,6 +671,50 @@ def test_hooks_and_methods_on_an_instance_cannot_be_known() -> None:
             value_of(element, [])
 
 
+def test_methods_are_told_apart_by_their_code_defaults_and_closures_and_by_the_class(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    held = [0.0]
+
+    class Changing(PurePrism):
+        pure = True
+        offset, offsets = 0.0, [0.0]
+
+        def __init__(self) -> None:
+            super().__init__()
+
+        def more(self, amount: list[float] = [0.0]) -> float:  # noqa: B006
+            return amount[0] + held[0]
+
+        @property
+        def rest(self) -> float:
+            return 0.0
+
+        def strength(self) -> Tensor:
+            return super().strength() + self.more() + self.rest
+
+    camera = camera_of("pure")
+    camera[0].lens.elements[2] = Changing().double()
+    vergence = optics.ThinLens.vergence
+    changes: list[Callable[[], Any]] = [
+        lambda: None,
+        lambda: Changing.more.__defaults__.__getitem__(0).__setitem__(0, 0.5),
+        lambda: held.__setitem__(0, 0.7),
+        lambda: setattr(Changing.rest.fget, "__code__", (lambda self: 0.4).__code__),
+        lambda: monkeypatch.setattr(optics.ThinLens, "vergence", lambda self, grid: vergence(self, grid) + 0.05),
+        monkeypatch.undo,
+    ]
+    with torch.no_grad():
+        before = None
+        for change in changes:
+            change()
+            picture = camera(scene_of())
+            assert torch.equal(picture, anew(camera)(scene_of()))
+            assert before is None or not torch.equal(picture, before)
+            before = picture
+        assert kept_as(camera[0].lens, camera[0].lens)
+
+
 def test_what_is_handed_out_may_be_changed() -> None:
     stage, scene = camera_of("pixels")[0], scene_of()
     question = {"vergences": torch.tensor([1 / 1.2], dtype=DOUBLE), "shape": (9, 9), "like": scene.coefficients}
