@@ -491,7 +491,7 @@ def _not_negative(light: Tensor, weights: Tensor | None) -> Tensor:
     floor = light.new_zeros(1)
     if weights is not None:
         floor = floor.where((weights.detach() >= 0).all(1), -math.inf)[:, None, None]
-    if not light.requires_grad:
+    if not differentiated(light):
         return torch.maximum(light, floor, out=light)
     return torch.where(light < floor, light - light.detach(), light)
 
