@@ -324,7 +324,8 @@ def honesty_table() -> str:
     lines += [
         "",
         f"{len(content['pairs'])} pairs, {content['drawn_again']} drawn again because their reference would have taken "
-        f"over a minute. Outside: {outside or 'none'}. Making the first plan of a pair took "
+        f"over {content.get('longest_seconds', 60):g} s. Outside: {outside or 'none'}. Making the first plan of a pair "
+        "took "
         f"{figures(content['summary'][0]['planning_share'])} times the reference's time in the median.",
     ]
     if hard := content.get("hard_summary"):
