@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -806,11 +809,18 @@ def test_provides_its_optics() -> None:
     assert imaging().fill_factor == 1.0
 
 
-@pytest.mark.parametrize("border", ["reflect", "replicate", "periodic", "zero"])
+def each_border_once() -> Iterator[Any]:
+    """Every border with every way to hold spectra; in the quick tests each border with one of them."""
+    ways = list(itertools.product({"strips": 1, "whole": 2**17}.items(), {"again": 0, "held": 1000}.items()))
+    for index, border in enumerate(["reflect", "replicate", "periodic", "zero"]):
+        for number, ((cut, strips), (kept, held)) in enumerate(ways):
+            marks = [] if number == index else [pytest.mark.slow]
+            yield pytest.param(border, strips, held, marks=marks, id=f"{border}-{cut}-spectra {kept}")
+
+
+@pytest.mark.parametrize(("border", "strips", "held"), each_border_once())
 @pytest.mark.parametrize("factors", [None, 5])
 @pytest.mark.parametrize("bands", [3, 1000], ids=["in parts", "at once"])
-@pytest.mark.parametrize("held", [0, 1000], ids=["spectra again", "spectra held"])
-@pytest.mark.parametrize("strips", [1, 2**17], ids=["strips", "whole"])
 def test_the_contraction_has_the_gradient_of_its_formula(
     monkeypatch, border: str, factors: int | None, bands: int, held: int, strips: int
 ) -> None:
