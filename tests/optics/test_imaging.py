@@ -818,7 +818,7 @@ def each_border_once() -> Iterator[Any]:
             yield pytest.param(border, strips, held, marks=marks, id=f"{border}-{cut}-spectra {kept}")
 
 
-@pytest.mark.parametrize(("border", "strips", "held"), each_border_once())
+@pytest.mark.parametrize(("border", "strips", "held"), list(each_border_once()))
 @pytest.mark.parametrize("factors", [None, 5])
 @pytest.mark.parametrize("bands", [3, 1000], ids=["in parts", "at once"])
 def test_the_contraction_has_the_gradient_of_its_formula(
