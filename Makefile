@@ -7,7 +7,8 @@ PIP_INSTALL := -m pip --disable-pip-version-check install -qq --constraint const
 PIP := $(BIN)/python $(PIP_INSTALL)
 WORKERS ?= 2
 # One thread per worker: torch's own threads fight over the cores that pytest-xdist already uses.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+# Neighbours go to one worker, which sets up what they share once.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-style bench-styles bench-data lint types check wheel-test clean
