@@ -19,9 +19,9 @@ from matplotlib.text import Text
 from PIL import Image
 
 import kcam
-from kcam import Camera, cli, demo, files, plots
+from kcam import Camera, cli, demo, files, optics, plots
 from kcam.scene import read_picture
-from kcam.units import nm
+from kcam.units import mm, nm
 
 
 def unboxed(text: str) -> str:
@@ -304,7 +304,7 @@ def test_a_raw_of_twelve_bits_comes_back_from_a_tiff(tmp_path: Path) -> None:
 
 
 def test_a_psf_figure_of_a_lens() -> None:
-    lens = Camera.phone()[0].lens
+    lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
     figure = plots.psf_figure(lens, distances=[2.0], wavelengths=[550 * nm])
     assert any("pixels of 4" in text.get_text() for text in figure.findobj(Text))
     with pytest.raises(TypeError, match=r"of an optics.Imaging or a Lens, got Camera. Use camera\[0\]"):

@@ -335,7 +335,7 @@ class TestReflectancesAndSensitivities:
 
 class TestAnyGrid:
     @given(tenths=grids)
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=25, deadline=None)
     def test_everything_is_finite_and_physical(self, tenths: list[int]) -> None:
         grid = torch.tensor(tenths, dtype=torch.float64) * 0.1 * nm
         for lamp in ("D65", "HP1"):

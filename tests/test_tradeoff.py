@@ -52,7 +52,7 @@ def with_doe() -> Camera:
 
 @pytest.fixture(scope="module")
 def rows_of_every_propagator() -> Sweep:
-    scene = Scene.builtin("star", 20, wavelengths=wavelength_grid(count=3))
+    scene = Scene.builtin("star", 20, wavelengths=wavelength_grid(count=2))
     return tradeoff.sweep(with_doe(), scene, knobs=["propagator", "baseline"], seconds=0)
 
 

@@ -61,7 +61,7 @@ def choice(plan: Plan, effect: str) -> str:
 def test_random_pairs_stay_inside_the_tolerance_and_the_estimates_near_the_truth() -> None:
     """A sample of benchmarks/planner.py, which measures 300 pairs."""
     ratios = []
-    for seed in (4, 6, 9, 15):
+    for seed in (4, 9, 15):
         shot, light, text, _ = random_pair(seed, longest=1.0)
         with torch.no_grad():
             planner, truth = Planner(shot, light), noiseless_raw(shot)(light)
