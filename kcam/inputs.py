@@ -300,10 +300,9 @@ def _laid_out(
         what.append("channels last")
         order = (0, 3, 1, 2) if len(shape) == 4 else (2, 0, 1)
         shape, code = tuple(shape[axis] for axis in order), f"{code}.permute{order}"
-    ahead = ":, " if len(shape) == 4 else ""
     if shape[-3] == ALPHA and channels is not None and 3 in channels and ALPHA not in channels:
         what.append("red, green, blue and alpha, which to drop")
-        shape, code = (*shape[:-3], 3, *shape[-2:]), f"{code}[{ahead}:3]"
+        shape, code = (*shape[:-3], 3, *shape[-2:]), f"{code}[..., :3, :, :]"
     elif shape[-3] == 1 and 1 not in taken and 3 in taken:
         what.append("gray")
         shape, code = (*shape[:-3], 3, *shape[-2:]), f"{code}.expand({'-1, ' if len(shape) == 4 else ''}3, -1, -1)"

@@ -322,7 +322,7 @@ def check_pair(name: str, door: str) -> None:
         (lambda x: Camera.ideal()(x), r"Probably a picture: use Scene.from_rgb\(image, depth=2.0\)."),
         (lambda x: imaging()(last(x)), r"a picture, channels last: use Scene.from_rgb\(bands.permute\(0, 3, 1, 2\)"),
         (lambda x: KC.RandomExposure(p=1.0)(last(x)), r"Probably channels last: use image.permute\(0, 3, 1, 2\)."),
-        (lambda x: KC.RandomExposure(p=1.0)(with_alpha(x)), r"alpha, which to drop: use image\[:, :3\]."),
+        (lambda x: KC.RandomExposure(p=1.0)(with_alpha(x)), r"alpha, which to drop: use image\[..., :3, :, :\]."),
         (lambda x: KC.RandomExposure(p=1.0)((x - 0.45) / 0.22), r"by mean and deviation: use image \* std \+ mean."),
         (lambda x: Scene.from_rgb((x - 0.45) / 0.22), r"by mean and deviation: use image \* std \+ mean."),
         (

@@ -115,6 +115,8 @@ class Imaging(Stage):
         if coverage not in COVERAGES:
             raise ValueError(f"unknown coverage {coverage!r}; known: {', '.join(COVERAGES)}.")
         if layers is not None:
+            if isinstance(layers, bool):
+                raise TypeError(f"layers must be a number, distances in metres, or None, got {layers}.")
             layers = int(layers) if isinstance(layers, int | Integral) else _distances(layers)
         for name, value, of in (
             ("layers", layers if isinstance(layers, int) else None, "depth layers"),
@@ -498,7 +500,12 @@ def _not_negative(light: Tensor, weights: Tensor | None) -> Tensor:
 
 def _distances(layers: Sequence[float] | Tensor) -> tuple[float, ...]:
     """Distances of layers [m] from far to near, each once."""
-    found = torch.as_tensor(layers, dtype=torch.float64).detach().flatten()
+    try:
+        found = torch.as_tensor(layers, dtype=torch.float64).detach().flatten()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(
+            f"layers must be a number, distances in metres such as (0.5, 2.0), or None, got {layers!r}."
+        ) from error
     if not found.numel():
         raise ValueError("layers holds no distance; give some, such as layers=(0.5, 2.0) in metres, a number, or None.")
     for distance in found.tolist():

@@ -259,6 +259,12 @@ def test_bad_layers_say_what_is_wrong(arguments: dict, text: str) -> None:
         imaging(**arguments)
 
 
+@pytest.mark.parametrize("layers", ["a", (1, None), {2.0}, True, 2 + 1j])
+def test_what_names_no_layers_is_said(layers) -> None:
+    with pytest.raises(TypeError, match="layers must be a number, distances in metres"):
+        imaging(layers=layers)
+
+
 # ---- colours that hide colours -----------------------------------------------------------------------------------
 
 
