@@ -70,13 +70,13 @@ class Dispersion(optics.Element):
 
     symmetric, focuses = True, False
 
-    def __init__(self, vergences: Tensor) -> None:
+    def __init__(self, vergences: Tensor, wavelengths: Tensor) -> None:
         super().__init__()
-        self.vergences = vergences
+        self.vergences, self.wavelengths = vergences, wavelengths
 
     def vergence(self, wavelengths: Tensor) -> Tensor:
-        """Given for the wavelengths that will be asked for."""
-        return self.vergences
+        """That of the nearest wavelength."""
+        return self.vergences[(wavelengths[:, None] - self.wavelengths).abs().argmin(1)]
 
 
 def lens_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
@@ -92,7 +92,7 @@ def lens_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor])
         if "rms" in own:
             elements.append(optics.ZernikeAberration(augmentation.coefficients(own)[0]))
         if "axial" in own:
-            elements.append(Dispersion(augmentation.vergences(own, wavelengths)[0, 0]))
+            elements.append(Dispersion(augmentation.vergences(own, wavelengths)[0, 0], wavelengths))
             row = magnified(row, 1 + float(own["lateral"]) * augmentation.dispersion(wavelengths)[1])
         imaging = optics.Imaging(
             optics.Lens(*elements, focus_distance=float(own.get("focus", torch.inf))),
