@@ -209,6 +209,11 @@ def _whole(values: np.ndarray, valid: np.ndarray | None = None) -> Callable[[int
     return rows
 
 
+def _without(wanted: str, names: Iterable[str]) -> CubeError:
+    """The error of a file that lacks what was asked for."""
+    return CubeError(f"it has no {wanted}, only {', '.join(names) or 'nothing'}.")
+
+
 def _check_size(shape: Iterable[int], what: str = "its array") -> tuple[int, ...]:
     """A shape as it stands in a header, before anything is read; CubeError for one that no cube has."""
     sizes = tuple(int(size) for size in shape)
@@ -326,7 +331,7 @@ def _open_hdf5(
             if link is not None and not isinstance(link, h5py.HardLink):
                 raise CubeError(f"its {name!r} is a link to elsewhere, which is not followed.")
         if key not in file:
-            raise CubeError(f"it has no array {key!r}, only {', '.join(sorted(file)) or 'nothing'}.")
+            raise _without(f"array {key!r}", sorted(file))
         array = file[key]
         if not isinstance(array, h5py.Dataset) or array.ndim != 3 or array.dtype.kind not in "fui":
             raise CubeError(f"its {key!r} is no array of numbers with three axes.")
@@ -410,7 +415,7 @@ def _mat_array(path: Path, name: str) -> np.ndarray:
     _check_mat_tags(path)
     arrays = _mat_arrays(path)
     if name not in arrays:
-        raise CubeError(f"it has no array {name!r}, only {', '.join(sorted(arrays)) or 'nothing'}.")
+        raise _without(f"array {name!r}", sorted(arrays))
     sizes = _check_size(arrays[name], f"its {name!r}")
     _check_bomb(int(np.prod(sizes, dtype=np.int64)), path.stat().st_size, f"its {name!r}")  # at a byte a value
     found = loadmat(str(path), variable_names=[name]).get(name)
@@ -458,9 +463,9 @@ def _open_cassi(path: Path, options: Options) -> Source:
     names = _mat_arrays(path)
     key = options.key or next((name for name in _CASSI_KEYS if name in names), None)
     if options.key is not None and options.key not in names:
-        raise CubeError(f"it has no array {options.key!r}, only {', '.join(names) or 'nothing'}.")
+        raise _without(f"array {options.key!r}", names)
     if key is None:
-        raise CubeError(f"it has none of the arrays {', '.join(_CASSI_KEYS)}, only {', '.join(names) or 'nothing'}.")
+        raise _without(f"array {' or '.join(_CASSI_KEYS)}", names)
     divisor, clip, group = _CASSI_KEYS.get(key, (1.0, False, None))
     values = _mat_array(path, key)
     if values.ndim != 3:
@@ -684,11 +689,9 @@ def _open_npz(path: Path, options: Options) -> Source:
                 heads[member.filename.removesuffix(".npy")] = (shape, dtype, member)
     key = options.key or next((name for name in _NPZ_KEYS if name in heads and len(heads[name][0]) == 3), None)
     if options.key is not None and options.key not in heads:
-        raise CubeError(f"it has no array {options.key!r}, only {', '.join(heads) or 'nothing'}.")
+        raise _without(f"array {options.key!r}", heads)
     if key is None:
-        raise CubeError(
-            f"it has no array {' or '.join(_NPZ_KEYS)} of three axes, only {', '.join(heads) or 'nothing'}."
-        )
+        raise _without(f"array {' or '.join(_NPZ_KEYS)} of three axes", heads)
     shape, dtype, member = heads[key]
     if dtype.hasobject or dtype.kind not in "fui" or len(shape) != 3:
         raise CubeError(f"its {key!r} is {shape} of {dtype}, expected numbers with three axes.")
