@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from draws import Draw
 from torch import Tensor
 
 from kcam import Camera, optics
@@ -21,31 +22,16 @@ QUICK, ALL = range(3), range(3, 50)
 BANDS = 10
 
 
-class Draw:
-    """Seeded numbers."""
-
-    def __init__(self, seed: int) -> None:
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def number(self, low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64))
-
-    def one_of(self, *choices):
-        return choices[int(torch.randint(len(choices), (), generator=self.generator))]
-
-    def noise(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator, dtype=torch.float64)
-
-    def lens(self, kind: str) -> optics.Lens:
-        """An ideal lens, a singlet whose colours are in focus at different distances, or that behind a rough DOE."""
-        focal = self.number(10, 50) * mm
-        glass: optics.Element = optics.ThinLens(focal)
-        if kind != "ideal":
-            name, index = self.one_of(("N-BK7", 1.517), ("N-SF11", 1.785))
-            glass = optics.PlanoConvexLens((index - 1) * focal, glass=name)
-        others = (optics.DOE(self.number(0, 12) * self.noise(24, 24)),) if kind == "rough" else ()
-        aperture = optics.CircularAperture(focal / self.number(6, 20))
-        return optics.Lens(aperture, glass, *others, focus_distance=self.one_of(0.5, 1.0, 2.0, 5.0))
+def random_lens(draw: Draw, kind: str) -> optics.Lens:
+    """An ideal lens, a singlet whose colours are in focus at different distances, or that behind a rough DOE."""
+    focal = draw.number(10, 50) * mm
+    glass: optics.Element = optics.ThinLens(focal)
+    if kind != "ideal":
+        name, index = draw.one_of(("N-BK7", 1.517), ("N-SF11", 1.785))
+        glass = optics.PlanoConvexLens((index - 1) * focal, glass=name)
+    others = (optics.DOE(draw.number(0, 12) * draw.noise(24, 24)),) if kind == "rough" else ()
+    aperture = optics.CircularAperture(focal / draw.number(6, 20))
+    return optics.Lens(aperture, glass, *others, focus_distance=draw.one_of(0.5, 1.0, 2.0, 5.0))
 
 
 def largest(found: Tensor, truth: Tensor) -> float:
@@ -62,7 +48,7 @@ def between_layers(seed: int, kind: str) -> tuple[float, float]:
     The map holds many distances: a dark strip at its lower edge, out of the window's reach, runs over half a wave.
     """
     draw = Draw(seed)
-    lens = draw.lens(draw.one_of("ideal", "singlet", "rough"))
+    lens = random_lens(draw, draw.one_of("ideal", "singlet", "rough"))
     semi = float(lens.aperture.semi_aperture())
     wavelengths = wavelength_grid(count=BANDS)
     distance = lens.query(wavelengths, distances=2.0, pixel_pitch=4 * um, shape=(1, 1)).sensor_distance
@@ -303,7 +289,7 @@ def check_coverage(seed: int, lens: str) -> None:
     draw = Draw(seed)
     kind, scene = colour_scene(draw)
     colours = ColourFilter.kodak() if draw.one_of(True, False) else ColourFilter.learned(tile=4)
-    stage = optics.Imaging(draw.lens(lens), pixel_pitch=draw.one_of(2, 4, 6) * um, layers=4, psf_shape=(33, 33))
+    stage = optics.Imaging(random_lens(draw, lens), pixel_pitch=draw.one_of(2, 4, 6) * um, layers=4, psf_shape=(33, 33))
     with torch.no_grad():
         truth = colours(stage(scene), Context(wavelengths=scene.wavelengths))
         channel, band = (stage.changed(coverage=c)(scene, colour_filter=colours) for c in ("channel", "band"))

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from draws import Draw
 from torch import Tensor
 
 from kcam import optics
@@ -19,28 +20,13 @@ WAYS: list[dict] = [{}, {"tile": 16}, {"direct": True}, {"max_memory": 1e5}]
 QUICK, ALL = range(12), range(12, 130)
 
 
-class Draw:
-    """Seeded numbers."""
-
-    def __init__(self, seed: int) -> None:
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def number(self, low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64))
-
-    def one_of(self, *choices):
-        return choices[int(torch.randint(len(choices), (), generator=self.generator))]
-
-    def noise(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator, dtype=torch.float64)
-
-    def lens(self) -> optics.Lens:
-        focal = self.number(10, 50) * mm
-        glass = self.one_of(
-            optics.ThinLens(focal), optics.PlanoConvexLens(0.517 * focal, glass="N-BK7"), optics.ThinLens(focal)
-        )
-        aperture = optics.CircularAperture(focal / self.number(6, 20))
-        return optics.Lens(aperture, glass, focus_distance=self.number(1, 5))
+def random_lens(draw: Draw) -> optics.Lens:
+    focal = draw.number(10, 50) * mm
+    glass = draw.one_of(
+        optics.ThinLens(focal), optics.PlanoConvexLens(0.517 * focal, glass="N-BK7"), optics.ThinLens(focal)
+    )
+    aperture = optics.CircularAperture(focal / draw.number(6, 20))
+    return optics.Lens(aperture, glass, focus_distance=draw.number(1, 5))
 
 
 def lamps(draw: Draw, size: int, *, ratio: float) -> tuple[str, Tensor]:
@@ -94,7 +80,9 @@ def check_lamps(seed: int) -> None:
     draw = Draw(seed)
     what, scene = lamp_scene(draw, draw.one_of(24, 31, 40))
     border, way, fused = draw.one_of(*BORDERS), draw.one_of(*WAYS), draw.one_of(True, False)
-    stage = optics.Imaging(draw.lens(), pixel_pitch=draw.number(2, 6) * um, border=border, psf_shape=(17, 15), **way)
+    stage = optics.Imaging(
+        random_lens(draw), pixel_pitch=draw.number(2, 6) * um, border=border, psf_shape=(17, 15), **way
+    )
     colours = ColourFilter.kodak() if fused else None
     found = stage(scene, colour_filter=colours)
     truth = stage(scene.to(dtype=torch.float64), colour_filter=colours)
