@@ -6,7 +6,6 @@ import base64
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -94,8 +93,7 @@ def style_sheet(
 
 def _pictures(camera: Camera, scene: Scene, seed: int) -> list[np.ndarray]:
     """The scene, the camera's picture before its style stage, and after it if there is one."""
-    depth = scene.depth[:1] if isinstance(scene.depth, Tensor) else scene.depth
-    scene = replace(scene, coefficients=scene.coefficients[:1], depth=depth)
+    scene = scene.samples([0])
     split = next((i for i, stage in enumerate(camera) if isinstance(stage, isp.StyleStage)), len(camera))
     generator = torch.Generator(scene.device).manual_seed(seed)
     pictures = [scene.to_srgb(), camera[:split](scene, generator=generator)]

@@ -260,6 +260,11 @@ class Scene:
         """The same scene at other distances [m]."""
         return _in_metres(replace(self, depth=depth))
 
+    def samples(self, rows: Sequence[int] | Tensor | slice) -> Scene:
+        """Some samples of the batch, with the distances that are theirs."""
+        depth = self.depth[rows] if isinstance(self.depth, Tensor) else self.depth
+        return replace(self, coefficients=self.coefficients[rows], depth=depth)
+
     def resized(self, size: int | tuple[int, int]) -> Scene:
         """The scene at another size: the longer side [pixels], or (height, width), for which it is cropped in its
         middle. Colours are filtered in linear light, distances picked.

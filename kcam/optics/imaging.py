@@ -115,11 +115,8 @@ class Imaging(Stage):
         if coverage not in COVERAGES:
             raise ValueError(f"unknown coverage {coverage!r}; known: {', '.join(COVERAGES)}.")
         if layers is not None:
-            if isinstance(layers, bool):
-                raise TypeError(f"layers must be a number, distances in metres, or None, got {layers}.")
-            layers = int(layers) if isinstance(layers, int | Integral) else _distances(layers)
+            layers = _count_or_distances(layers)
         for name, value, of in (
-            ("layers", layers if isinstance(layers, int) else None, "depth layers"),
             ("bands", bands, "wavelengths"),
             ("tile", tile, "pixels"),
             ("rank", rank, "factors"),
@@ -370,7 +367,7 @@ class Imaging(Stage):
     def work(self, scene: Scene, *, channels: int | None = None) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
         if len(apart := alike(scene)) > 1:
-            works = [self.work(_rows(scene, rows), channels=channels) for rows in apart]
+            works = [self.work(scene.samples(rows), channels=channels) for rows in apart]
             return sum(works[1:], works[0])
         planes = self._working(scene)
         batch, count, height, width = planes.shape
@@ -426,7 +423,7 @@ class Imaging(Stage):
         if planes.numel() == 0:
             return planes.new_zeros(batch, channels, height, width) + planes.sum()
         if len(groups := alike(scene)) > 1:
-            parts = [self._render(_rows(scene, rows), planes[rows.to(planes.device)], contraction) for rows in groups]
+            parts = [self._render(scene.samples(rows), planes[rows], contraction) for rows in groups]
             return torch.cat(parts)[torch.cat(groups).argsort().to(planes.device)]
         spectra = None if scene.spectra is None else scene.spectra.to(planes)
         weights = None if contraction is None else contraction.to(planes)
@@ -498,9 +495,15 @@ def _not_negative(light: Tensor, weights: Tensor | None) -> Tensor:
     return torch.where(light < floor, light - light.detach(), light)
 
 
-def _distances(layers: Sequence[float] | Tensor) -> tuple[float, ...]:
-    """Distances of layers [m] from far to near, each once."""
+def _count_or_distances(layers: int | Sequence[float] | Tensor) -> int | tuple[float, ...]:
+    """A number of layers, or their distances [m] from far to near, each once."""
+    if isinstance(layers, Integral) and not isinstance(layers, bool):
+        if layers < 1:
+            raise ValueError(f"layers must be a positive number of depth layers, or None, got {layers}.")
+        return int(layers)
     try:
+        if isinstance(layers, bool):
+            raise TypeError("a truth value is no number")
         found = torch.as_tensor(layers, dtype=torch.float64).detach().flatten()
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(
@@ -537,12 +540,6 @@ def alike(scene: Scene) -> list[Tensor]:
     for row, distance in enumerate(depth.tolist()):
         groups.setdefault(distance, []).append(row)
     return [torch.tensor(rows) for rows in groups.values()]
-
-
-def _rows(scene: Scene, rows: Tensor) -> Scene:
-    """Some samples of a batch, all at the distance of the first."""
-    depth = scene.depth[rows[:1]] if isinstance(scene.depth, Tensor) else scene.depth
-    return replace(scene, coefficients=scene.coefficients[rows.to(scene.device)], depth=depth)
 
 
 def _map_work(query: Query) -> float:

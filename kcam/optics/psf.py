@@ -283,7 +283,7 @@ def _ray_displacement(query: Query, share: float) -> Tensor:
         if query.scatter is None:
             coefficients, maps = residual_path(outermost, pupil)
         else:
-            rings += _ring_displacement(query, share)
+            rings += _ring_displacement(query, query.scatter, share)
             others = [element for element in lens.elements if not element.symmetric]
             terms = [term for element in others for term in element.terms(pupil, query.wavelengths.to(query.device))]
             if not terms:
@@ -299,15 +299,13 @@ def _ray_displacement(query: Query, share: float) -> Tensor:
         return rings + (slope * query.sensor_distance).cpu()
 
 
-def _ring_displacement(query: Query, share: float) -> float:
+def _ring_displacement(query: Query, scatter: Scatter, share: float) -> float:
     """Where the steepest ray of the symmetric path lands, or all but a share of what its rings scatter [m]."""
-    if query.scatter is None:
-        return 0.0
     edges, outermost = query.panels, _outermost(query)
     rho = edges[:-1, None] + edges.diff()[:, None] * torch.linspace(0, 1, 13).to(edges)
     phase = radial_phase(query)(rho.flatten()).unflatten(-1, (-1, 13))
     slope = (phase.diff() * (12 / edges.diff()[:, None])).abs().amax(dim=(1, 2)) / (2 * math.pi)
-    farthest = torch.maximum(slope, query.scatter.reach(share)).view(outermost.wavelengths.numel(), -1).amax(1)
+    farthest = torch.maximum(slope, scatter.reach(share)).view(outermost.wavelengths.numel(), -1).amax(1)
     return float(
         (farthest.cpu() * outermost.wavelengths).max() * query.sensor_distance.cpu() / query.semi_aperture.cpu()
     )

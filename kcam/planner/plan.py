@@ -198,16 +198,8 @@ class Plan:
             return camera
         stages = shortened(camera, self.changes, self.skipped)
         known = self.trained if self.gradients else ()
-        ahead = noiseless_raw(camera)
-        unplanned = (
-            []
-            if known is None
-            else [
-                p
-                for name, p in camera.named_parameters()
-                if name not in known and any(p is q for q in ahead.parameters())
-            ]
-        )
+        ahead = set() if known is None else {*noiseless_raw(camera).parameters()}  # by identity
+        unplanned = [p for name, p in camera.named_parameters() if p in ahead and name not in (known or ())]
         return PlannedCamera(*stages, context=stages.context, plan=self, unplanned=unplanned)
 
     def outside(self, camera: Camera, scene: Scene) -> str | None:

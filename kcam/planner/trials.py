@@ -264,10 +264,10 @@ def _sample(
         factors[row] = math.sqrt(covered[-1] / min(covered)) if covered else 1.0
     size = {"height": min(extent, height), "width": min(extent, width)}
     if height * width <= pixels or len(rows) * height * width <= len(crops) * size["height"] * size["width"]:
-        part = [_rows(scene, [row]) for row in rows]
+        part = [scene.samples([row]) for row in rows]
         crops, factors = [(row, 0, 0) for row in rows], dict.fromkeys(rows, 1.0)
     else:
-        part = [_rows(scene, [row]).crop(top=top, left=left, **size) for row, top, left in crops]
+        part = [scene.samples([row]).crop(top=top, left=left, **size) for row, top, left in crops]
     maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
     depth: float | Tensor = scene.depth
     if isinstance(depth, Tensor):  # maps, or numbers of one per sample
@@ -275,11 +275,6 @@ def _sample(
     together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
     owners = tuple(first + row for row, _, _ in crops)
     return Sample(together, owners, tuple(factors[row] for row, _, _ in crops))
-
-
-def _rows(scene: Scene, rows: list[int]) -> Scene:
-    depth = scene.depth[rows] if isinstance(scene.depth, Tensor) else scene.depth
-    return replace(scene, coefficients=scene.coefficients[rows], depth=depth)
 
 
 def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:

@@ -428,10 +428,11 @@ class DarkCurrent(RandomStage):
         check_positive(doubling_temperature, name="doubling_temperature", unit="K")
         for name, value in (("temperature", temperature), ("reference_temperature", reference_temperature)):
             degrees = torch.as_tensor(0.0 if value is None else value).detach()
-            if not ((degrees >= -273.15) & (degrees <= 200)).all():
-                odd = degrees[~((degrees >= -273.15) & (degrees <= 200))].flatten()[0].item()
+            odd = ~((degrees >= -273.15) & (degrees <= 200))
+            if odd.any():
                 raise ValueError(
-                    f"{name} {odd:g} is outside -273.15..200 degrees C, such as 25. From kelvin subtract 273.15."
+                    f"{name} {degrees[odd][0]:g} is outside -273.15..200 degrees C, such as 25. From kelvin subtract "
+                    "273.15."
                 )
         check_full_well(full_well)
         hold(

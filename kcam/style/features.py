@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from kcam.inputs import check_floats, remedy
+from kcam.inputs import check_picture
 
 SCALES = 4
 ORIENTATIONS = 6
@@ -32,10 +32,7 @@ NATURAL = {"colour": 0.25, "low": 0.2, "scale 0": 0.02, "scale 1": 0.008, "scale
 
 def check_pictures(picture: Tensor, *, multiple: int, least: int) -> None:
     """TypeError, ValueError unless it is (B,3,H,W) of a size that the features can be taken of."""
-    check_floats(picture, name="picture", takes="(B,3,H,W)", channels=(3,), ndims=(4,))
-    if picture.ndim != 4 or picture.shape[1] != 3:
-        fix = remedy(picture, name="picture", channels=(3,), ndims=(4,))
-        raise ValueError(f"features are taken of pictures (B,3,H,W), got shape {tuple(picture.shape)}.{fix}")
+    check_picture(picture, name="picture", takes="(B,3,H,W)", channels=(3,), ndims=(4,), within=None)
     height, width = picture.shape[-2:]
     if min(height, width) < least or height % multiple or width % multiple:
         better = tuple(max(least, size // multiple * multiple) for size in (height, width))

@@ -122,8 +122,8 @@ def test_natural_is_that_of_the_builtin_photographs(features: SteerableFeatures)
     [
         (torch.rand(1, 3, 72, 64), ValueError, "of 72 x 64 has no features: both sides must be multiples of 16"),
         (torch.rand(1, 3, 150, 30), ValueError, "at least 64 pixels. Crop or resize it, to 144 x 64 for instance."),
-        (torch.rand(3, 64, 64), ValueError, "pictures (B,3,H,W), got shape (3, 64, 64). Use picture[None]."),
-        (torch.rand(1, 1, 64, 64), ValueError, "features are taken of pictures (B,3,H,W), got shape (1, 1, 64, 64)."),
+        (torch.rand(3, 64, 64), ValueError, "shape (3, 64, 64), expected 3 channels: (B,C,H,W). Use picture[None]."),
+        (torch.rand(1, 1, 64, 64), ValueError, "shape (1, 1, 64, 64), expected 3 channels: (B,C,H,W)."),
         (torch.ones(1, 3, 64, 64).byte(), TypeError, "floating-point tensor (B,3,H,W), got a tensor (1, 3, 64, 64) of"),
         (np.ones((1, 3, 64, 64)), TypeError, "got an array (1, 3, 64, 64) of float64. Use torch.from_numpy("),
     ],
