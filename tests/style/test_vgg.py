@@ -238,7 +238,7 @@ def test_flat_styles_stay_finite(features: VGG16Features, level: float):
     [
         (torch.rand(1, 3, 36, 32), ValueError, "36 x 32 has no features: both sides must be multiples of 8"),
         (torch.rand(1, 3, 24, 24), ValueError, "at least 32 pixels. Crop or resize it, to 32 x 32"),
-        (torch.rand(3, 32, 32), ValueError, "got shape (3, 32, 32). Use picture[None]."),
+        (torch.rand(3, 32, 32), ValueError, "shape (3, 32, 32), expected 3 channels: (B,C,H,W). Use picture[None]."),
         (torch.zeros(1, 3, 32, 32, dtype=torch.uint8), TypeError, "tensor (1, 3, 32, 32) of torch.uint8. Use picture"),
     ],
 )
