@@ -137,6 +137,21 @@ def rows(seed: int) -> Answer:
     return answer
 
 
+def sampled(seed: int) -> Answer:
+    """What many queries cost, which their pupil grids decide: large windows, so that a little denser grid shows."""
+    draw, answer = Draw(seed), {}
+    for kind in KINDS:
+        optic = lens(kind, draw, torch.float64)
+        for member in range(4):
+            side = int(draw.number(50, 500))
+            query = optic.query(
+                wavelengths(draw, 3), distances=draw.number(0.3, 3), pixel_pitch=pitch(draw), shape=(side, side),
+                dtype=torch.float64,
+            )  # fmt: skip
+            answer[f"{kind} {member}"] = optics.PROPAGATORS["nonparaxial", "matrix"].cost(query)
+    return answer
+
+
 def batch(terms: int, layers: int, dtype: torch.dtype, seed: int) -> Answer:
     """`batch_psf`: with and without aberrations, one or several layers, one vergence for each wavelength."""
     draw = Draw(seed)
@@ -187,6 +202,7 @@ def _questions() -> list[Question]:
     for seed, kind in enumerate(KINDS):
         found.append(Question(f"what is said of {kind}", partial(said, kind, 400 + seed)))
     found.append(Question("rows of the table", partial(rows, 500)))
+    found.append(Question("costs of many queries", partial(sampled, 502)))
     ask = partial(by_row, "nonparaxial", "fft", torch.float64, 501, "wrapped radial DOE")
     found.append(Question("psf by nonparaxial/fft of many rings, float64", ask, slow=True))
     found.append(Question("psf by angular_spectrum of a fast lens, float64", fast_by_spectrum, slow=True))
