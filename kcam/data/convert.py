@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from kcam.data.bands import resampled
 from kcam.data.cube import SUFFIX, CubeError, words_of, write_source
-from kcam.data.readers import SUFFIXES, Options, open_source, resampled, scene_name, scenes_in
+from kcam.data.readers import SUFFIXES, open_source, scenes_in
+from kcam.data.readers.format import Options, scene_name
 
 
 @dataclass(frozen=True)
