@@ -132,10 +132,8 @@ def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
         return str(error)
     except OSError as error:
         return f"{type(error).__name__}: {error.strerror or error}"
-    except MemoryError:
-        return "it does not fit into memory."
     except Exception as error:
-        return f"it cannot be read: {words_of(error)}"
+        return words_of(error)
 
 
 def _depth(path: Path) -> np.ndarray:

@@ -40,14 +40,16 @@ class CubeError(ValueError):
 NOTHING_VALID = "it holds no valid pixel: all are NaN, infinite or marked as invalid."
 
 
-def words_of(error: BaseException) -> str:
-    """What a library's error says, in one line of bounded length.
+def words_of(error: Exception, what: str = "it cannot be read") -> str:
+    """What a library's error means for a cube, in one line of bounded length.
 
     Raises:    KeyboardInterrupt where that is its cause: compiled code into which Ctrl-C falls may end in SystemError.
     """
     if isinstance(error.__cause__, KeyboardInterrupt):
         raise error.__cause__
-    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
+    if isinstance(error, MemoryError):
+        return "it does not fit into memory."
+    return f"{what}: {type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
 
 
 @dataclass(frozen=True)
@@ -154,10 +156,8 @@ class Source:
                 values = np.ascontiguousarray(values, dtype=np.float32)
         except (CubeError, ImportError):
             raise
-        except MemoryError as error:
-            raise CubeError("it does not fit into memory.") from error
         except Exception as error:
-            raise CubeError(f"rows {first} to {last} cannot be read: {words_of(error)}") from error
+            raise CubeError(words_of(error, f"rows {first} to {last} cannot be read")) from error
         finite = np.isfinite(values).all(0)
         valid = finite if valid is None else valid & finite
         if valid.all():

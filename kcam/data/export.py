@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from kcam.data.patches import StoreError, read_manifest, scene_array
+from kcam.data.patches.manifest import read_manifest, scene_array
+from kcam.data.patches.plan import StoreError
 from kcam.files import replacing
 from kcam.units import nm
 

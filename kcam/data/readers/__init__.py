@@ -85,10 +85,8 @@ def open_source(path: Path, *, format: str | None = None, options: Options | Non
         return replace(source, facts={"format": row.name} | row.facts | source.facts).check()
     except (CubeError, ImportError, FileNotFoundError):
         raise
-    except MemoryError as error:
-        raise CubeError("it does not fit into memory.") from error
     except Exception as error:
-        raise CubeError(f"it cannot be read as {row.name}: {words_of(error)}") from error
+        raise CubeError(words_of(error, f"it cannot be read as {row.name}")) from error
 
 
 def recognised(path: Path) -> Format | None:
