@@ -81,7 +81,7 @@ def convert(
             report.failed[str(given)] = str(error)
     for path, facts in _run(list(jobs.values()), out, how, workers):
         if isinstance(facts, str):
-            report.failed[str(path)] = facts
+            report.failed[str(path)] = " ".join(facts.split())
         else:
             report.written[str(path)] = facts
         if advance:
@@ -113,12 +113,7 @@ def _run(
 
 
 def convert_one(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
-    """One scene: its facts, or why it failed, in one line."""
-    found = _convert(path, out, how)
-    return " ".join(found.split()) if isinstance(found, str) else found
-
-
-def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
+    """One scene: its facts, or why it failed."""
     name = scene_name(path)
     try:
         options = replace(how.options, bands=how.bands)

@@ -176,22 +176,13 @@ def write_cube(path: str | os.PathLike[str], cube: Cube) -> None:
         mask = cube.mask.numpy()
         bands = np.asarray(~mask.any((1, 2)) & mask.any())
         pixels = np.asarray(mask[~bands].all(0))
-    write_source(
-        path,
-        Source(
-            cube.name or Path(path).stem,
-            cube.shape,
-            cube.wavelengths.numpy(),
-            cube.unit,
-            lambda first, last: (
-                cube.values[:, first:last].numpy(),
-                None if pixels is None else pixels[first:last],
-            ),
-            dict(cube.source),
-            bands,
-            None if cube.depth is None else cube.depth.numpy(),
-        ),
-    )
+
+    def rows(first: int, last: int) -> tuple[np.ndarray, np.ndarray | None]:
+        return cube.values[:, first:last].numpy(), None if pixels is None else pixels[first:last]
+
+    name, grid, depth = cube.name or Path(path).stem, cube.wavelengths.numpy(), cube.depth
+    depths = None if depth is None else depth.numpy()
+    write_source(path, Source(name, cube.shape, grid, cube.unit, rows, dict(cube.source), bands, depths))
 
 
 STRIP = 2**24

@@ -73,10 +73,5 @@ def _open_kaist(path: Path, options: Options) -> Source:
     return Source(scene_name(path), (len(ordered), height, width), grid, "reflectance", rows, facts)
 
 
-KAIST = Format(
-    "kaist",
-    "EXR with channels w420nm ... w720nm",
-    _open_kaist,
-    (".exr",),
-    facts={"citation": "Choi et al., High-quality hyperspectral reconstruction using a spectral prior, ToG 2017"},
-)
+_CHOI = {"citation": "Choi et al., High-quality hyperspectral reconstruction using a spectral prior, ToG 2017"}
+KAIST = Format("kaist", "EXR with channels w420nm ... w720nm", _open_kaist, (".exr",), facts=_CHOI)

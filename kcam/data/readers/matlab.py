@@ -17,12 +17,9 @@ from kcam.data.readers.checks import check_promise, check_size, lacking
 from kcam.data.readers.format import Format, Options, array_source, in_metres, known_wavelengths, scaled, scene_name
 
 
-def _is_version(path: Path, version: str) -> bool:
+def _is_version(version: str, path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(10) == f"MATLAB {version}".encode()
-
-
-# ---- 7.3 -----------------------------------------------------------------------------------------------------------
 
 
 def _h5py() -> Any:
@@ -33,14 +30,14 @@ def _h5py() -> Any:
     return h5py
 
 
-def _holds(path: Path, *keys: str) -> bool:
-    if not _is_version(path, "7.3"):
+def _is_hdf5(key: str, path: Path) -> bool:
+    if not _is_version("7.3", path):
         return False
     with _h5py().File(path, "r") as file:
-        return set(keys) <= set(file)
+        return {key, "bands"} <= set(file)
 
 
-def _open_hdf5(path: Path, options: Options, *, usual: str, divisor: float) -> Source:
+def _open_hdf5(usual: str, divisor: float, path: Path, options: Options) -> Source:
     """An HDF5 array (L,W,H), the reverse of MATLAB's axes, with wavelengths beside it."""
     h5py, key = _h5py(), options.key or usual
     with h5py.File(path, "r") as file:
@@ -73,27 +70,12 @@ def _open_hdf5(path: Path, options: Options, *, usual: str, divisor: float) -> S
     return Source(scene_name(path), (count, height, width), grid, "relative radiance", rows, facts)
 
 
-ICVL = Format(
-    "icvl",
-    "MATLAB 7.3 with rad and bands",
-    partial(_open_hdf5, usual="rad", divisor=4095),
-    (".mat",),
-    lambda path: _holds(path, "rad", "bands"),
-    {"citation": "Arad and Ben-Shahar, Sparse recovery of hyperspectral signal, ECCV 2016"},
-)
-"""12 bits; some lie on their side."""
-ARAD_1K = Format(
-    "arad1k",
-    "MATLAB 7.3 with cube and bands",
-    partial(_open_hdf5, usual="cube", divisor=1),
-    (".mat",),
-    lambda path: _holds(path, "cube", "bands"),
-    {"citation": "Arad et al., NTIRE 2022 spectral recovery challenge, CVPRW 2022"},
-)
-"""Already 0 to 1."""
-
-
-# ---- 5 -------------------------------------------------------------------------------------------------------------
+_open_icvl = partial(_open_hdf5, "rad", 4095)  # 12 bits; some lie on their side
+_open_arad = partial(_open_hdf5, "cube", 1)  # already 0 to 1
+_ECCV = {"citation": "Arad and Ben-Shahar, Sparse recovery of hyperspectral signal, ECCV 2016"}
+_CVPRW = {"citation": "Arad et al., NTIRE 2022 spectral recovery challenge, CVPRW 2022"}
+ICVL = Format("icvl", "MATLAB 7.3 with rad and bands", _open_icvl, (".mat",), partial(_is_hdf5, "rad"), _ECCV)
+ARAD_1K = Format("arad1k", "MATLAB 7.3 with cube and bands", _open_arad, (".mat",), partial(_is_hdf5, "cube"), _CVPRW)
 
 
 def _arrays(path: Path) -> dict[str, tuple[int, ...]]:
@@ -167,13 +149,13 @@ def _open_harvard(path: Path, options: Options) -> Source:
     return array_source(path, options, cube, f"{key} / calib.txt", own=profile("harvard31"), valid=valid)
 
 
+def _is_harvard(path: Path) -> bool:
+    return _is_version("5.0", path) and {"ref", "lbl"} <= set(_arrays(path))
+
+
+_CVPR = {"citation": "Chakrabarti and Zickler, Statistics of real-world hyperspectral images, CVPR 2011"}
 HARVARD = Format(
-    "harvard",
-    "MATLAB 5 with ref and lbl, calib.txt beside it",
-    _open_harvard,
-    (".mat",),
-    lambda path: _is_version(path, "5.0") and {"ref", "lbl"} <= set(_arrays(path)),
-    {"citation": "Chakrabarti and Zickler, Statistics of real-world hyperspectral images, CVPR 2011"},
+    "harvard", "MATLAB 5 with ref and lbl, calib.txt beside it", _open_harvard, (".mat",), _is_harvard, _CVPR
 )
 
 _CASSI_KEYS = {
@@ -204,10 +186,8 @@ def _open_cassi(path: Path, options: Options) -> Source:
     return source if group is None else replace(source, facts=source.facts | {"group": group})
 
 
-CASSI = Format(
-    "cassi28",
-    "MATLAB 5 with HSI, img_expand, data_slice, img or img_hs",
-    _open_cassi,
-    (".mat",),
-    lambda path: _is_version(path, "5.0") and bool(set(_CASSI_KEYS) & set(_arrays(path))),
-)
+def _is_cassi(path: Path) -> bool:
+    return _is_version("5.0", path) and not set(_CASSI_KEYS).isdisjoint(_arrays(path))
+
+
+CASSI = Format("cassi28", "MATLAB 5 with HSI, img_expand, data_slice, img or img_hs", _open_cassi, (".mat",), _is_cassi)

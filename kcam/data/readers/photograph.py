@@ -34,11 +34,6 @@ def _open_rgb(path: Path, options: Options) -> Source:
     return Source(scene_name(path), shape, grid.numpy(), "reflectance", rows, facts, depth=options.depth)
 
 
-RGB = Format(
-    "rgb",
-    "a photograph, upsampled to spectra",
-    _open_rgb,
-    (".jpg", ".jpeg", ".png", ".webp", ".bmp"),
-    lambda path: False,
-)
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+RGB = Format("rgb", "a photograph, upsampled to spectra", _open_rgb, _SUFFIXES, lambda path: False)
 """Never recognised: that spectra are to be made up must be said."""

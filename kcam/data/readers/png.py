@@ -13,19 +13,15 @@ from kcam.data.readers.checks import check_promise, check_size
 from kcam.data.readers.format import Format, Options, array_source, scaled
 
 
-def _cave_files(path: Path) -> list[tuple[int, Path]]:
+def _files(path: Path) -> list[tuple[int, Path]]:
     """The PNGs of one CAVE scene by their number, from X_ms, X_ms/X_ms, or a folder that holds only the inner one."""
+    found: list[tuple[int, Path]] = []
     for folder in (path, path / path.name):
-        if not folder.is_dir():
-            continue
-        found = []
-        for file in folder.iterdir():
-            match = re.fullmatch(r".*_ms_(\d+)\.png", file.name, re.IGNORECASE)
-            if match and not file.name.startswith(".") and file.is_file():
+        for file in folder.iterdir() if folder.is_dir() and not found else ():
+            match = re.fullmatch(r"(?!\.).*_ms_(\d+)\.png", file.name, re.IGNORECASE)
+            if match and file.is_file():
                 found.append((int(match[1]), file))
-        if found:
-            return sorted(found)
-    return []
+    return sorted(found)
 
 
 def _read_png(path: Path) -> np.ndarray:
@@ -53,7 +49,7 @@ def _read_png(path: Path) -> np.ndarray:
 
 def _open_cave(path: Path, options: Options) -> Source:
     """CAVE (Yasuma et al. 2010): X_ms/X_ms_01.png to 31, 16 bits; band i at 400 + 10 (i - 1) nm."""
-    files = _cave_files(path)
+    files = _files(path)
     if not files:
         raise CubeError("it holds no bands such as X_ms_01.png.")
     numbers = [number for number, _ in files]
@@ -68,10 +64,5 @@ def _open_cave(path: Path, options: Options) -> Source:
     return array_source(path, options, values, "/ 65535", own=profile("cave31"), unit="reflectance")
 
 
-CAVE = Format(
-    "cave",
-    "a folder X_ms of 31 PNGs of 16 bits",
-    _open_cave,
-    fits=lambda path: bool(_cave_files(path)),
-    facts={"citation": "Yasuma et al., Generalized assorted pixel camera, TIP 2010"},
-)
+_YASUMA = {"citation": "Yasuma et al., Generalized assorted pixel camera, TIP 2010"}
+CAVE = Format("cave", "a folder X_ms of 31 PNGs of 16 bits", _open_cave, (), lambda path: bool(_files(path)), _YASUMA)
