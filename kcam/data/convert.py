@@ -71,12 +71,9 @@ def convert(
                 report.failed[str(given)] = f"there is no scene in it: expected {known}, or a folder X_ms of PNGs."
             for path in scenes:
                 name = scene_name(path)
-                if name in jobs and path.resolve() == jobs[name].resolve():
-                    continue
-                if name in jobs:
-                    report.failed[str(path)] = f"another input is called {name} too: {jobs[name]}."
-                else:
-                    jobs[name] = path
+                first = jobs.setdefault(name, path)
+                if first is not path and first.resolve() != path.resolve():
+                    report.failed[str(path)] = f"another input is called {name} too: {first}."
         except OSError as error:
             report.failed[str(given)] = str(error)
     for path, facts in _run(list(jobs.values()), out, how, workers):

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -31,6 +32,7 @@ VERSION = 1
 UNITS = ("reflectance", "radiance", "relative radiance")
 MOST_VALUES = 2**32
 """In one cube: a 31-band cube of 138 megapixels. More is taken for a damaged header."""
+_SLACK = 2**26  # bytes that a header may promise in any case
 
 
 class CubeError(ValueError):
@@ -50,6 +52,25 @@ def words_of(error: Exception, what: str = "it cannot be read") -> str:
     if isinstance(error, MemoryError):
         return "it does not fit into memory."
     return f"{what}: {type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
+
+
+def check_size(shape: Iterable[int], what: str = "its array") -> tuple[int, ...]:
+    """A shape as it stands in a header; CubeError for one that no cube has."""
+    sizes = tuple(int(size) for size in shape)
+    if not 1 <= prod(max(size, 0) for size in sizes) <= MOST_VALUES:
+        raise CubeError(f"{what} says it is {' x '.join(map(str, sizes))}: no cube has that size.")
+    return sizes
+
+
+def check_promise(promised: int, stored: int, what: str = "its header") -> None:
+    """CubeError where a header promises far more than its bytes can hold: no picture compresses to a 64th."""
+    if promised > 64 * stored + _SLACK:
+        raise CubeError(f"{what} promises {promised / 1e6:.0f} MB in {stored / 1e6:.3g} MB of data: it is damaged.")
+
+
+def lacking(wanted: str, names: Iterable[str]) -> CubeError:
+    """The error of a file that lacks what was asked for."""
+    return CubeError(f"it has no {wanted}, only {', '.join(names) or 'nothing'}.")
 
 
 @dataclass(frozen=True)

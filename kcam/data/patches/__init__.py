@@ -9,17 +9,8 @@ same. While it is being made, a folder .work holds a plan and a record of each s
 """
 
 from kcam.data.patches.manifest import MANIFEST, read_manifest
-from kcam.data.patches.plan import (
-    Settings,
-    StoreError,
-    StoreStopped,
-    group_of,
-    make_plan,
-    parse_split,
-    positions,
-    split_of,
-)
-from kcam.data.patches.store import extract
+from kcam.data.patches.plan import Settings, StoreError, group_of, make_plan, parse_split, positions, split_of
+from kcam.data.patches.store import StoreStopped, extract
 from kcam.data.patches.verification import verify
 
 __all__ = [

@@ -26,10 +26,6 @@ class StoreError(ValueError):
     """A patch store that cannot be made, continued or read; one line."""
 
 
-class StoreStopped(StoreError):
-    """A store that is not finished, for a reason that lies in none of its cubes; resume goes on with it."""
-
-
 @dataclass(frozen=True)
 class Settings:
     """What decides which patches there are.

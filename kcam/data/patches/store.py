@@ -19,10 +19,14 @@ from typing import Any, TypedDict
 
 from kcam.data.cube import CubeError, words_of
 from kcam.data.patches.manifest import MANIFEST, WORK, manifest_bytes, read_manifest, read_record, write_record
-from kcam.data.patches.plan import SceneJob, Settings, StoreError, StorePlan, StoreStopped
+from kcam.data.patches.plan import SceneJob, Settings, StoreError, StorePlan
 from kcam.data.patches.scene import extract_scene
 from kcam.files import replace
 from kcam.plain import from_json
+
+
+class StoreStopped(StoreError):
+    """A store that is not finished, for a reason that lies in none of its cubes; resume goes on with it."""
 
 
 class _Begun(TypedDict):

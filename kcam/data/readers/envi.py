@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kcam.data.cube import CubeError, Source
-from kcam.data.readers.checks import check_size
+from kcam.data.cube import CubeError, Source, check_size
 from kcam.data.readers.format import Format, Options, in_metres, known_wavelengths, scaled, scene_name
 from kcam.units import nm
 

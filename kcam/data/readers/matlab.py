@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from kcam.data.bands import profile
-from kcam.data.cube import CubeError, Source
-from kcam.data.readers.checks import check_promise, check_size, lacking
+from kcam.data.cube import CubeError, Source, check_promise, check_size, lacking
 from kcam.data.readers.format import Format, Options, array_source, in_metres, known_wavelengths, scaled, scene_name
 
 

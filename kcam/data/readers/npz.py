@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.lib import format as npy
 
-from kcam.data.cube import CubeError, Source
-from kcam.data.readers.checks import check_promise, check_size, lacking
+from kcam.data.cube import CubeError, Source, check_promise, check_size, lacking
 from kcam.data.readers.format import Format, Options, array_source, bands_first, in_metres, normalised
 
 _KEYS = ("values", "cube", "data", "bands", "img", "hsi")

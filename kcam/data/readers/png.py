@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kcam.data.bands import profile
-from kcam.data.cube import CubeError, Source
-from kcam.data.readers.checks import check_promise, check_size
+from kcam.data.cube import CubeError, Source, check_promise, check_size
 from kcam.data.readers.format import Format, Options, array_source, scaled
 
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import tifffile
 
-from kcam.data.cube import CubeError, Source
-from kcam.data.readers.checks import check_promise, check_size
+from kcam.data.cube import CubeError, Source, check_promise, check_size
 from kcam.data.readers.format import Format, Options, array_source, bands_first, normalised
 
 
