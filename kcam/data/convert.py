@@ -93,9 +93,8 @@ def _run(
         for path in paths:
             yield path, convert_one(path, out, how)
         return
-    left = list(paths)
+    left, several = list(paths), list(paths)
     while left:  # a library that crashes takes its process along: what was not done is done again, one by one
-        several = left if len(left) == len(paths) else left[:1]
         with ProcessPoolExecutor(min(workers, len(several)), mp_context=get_context("spawn")) as pool:
             running = {pool.submit(convert_one, path, out, how): path for path in several}
             for future in as_completed(running):
@@ -107,6 +106,7 @@ def _run(
                     found = "reading it crashed the process: it is damaged."
                 left.remove(running[future])
                 yield running[future], found
+        several = left[:1]
 
 
 def convert_one(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
