@@ -8,20 +8,6 @@ from kcam.data.patches import Settings, StoreError, extract, make_plan, verify
 from kcam.data.readers import FORMATS, read_cube
 
 __all__ = [
-    "FORMATS",
-    "PROFILES",
-    "Cube",
-    "CubeError",
-    "Patch",
-    "PatchDataset",
-    "Settings",
-    "StoreError",
-    "export_patches",
-    "extract",
-    "make_plan",
-    "parse_bands",
-    "read_cube",
-    "resampling",
-    "verify",
-    "write_cube",
-]
+    "FORMATS", "PROFILES", "Cube", "CubeError", "Patch", "PatchDataset", "Settings", "StoreError", "export_patches",
+    "extract", "make_plan", "parse_bands", "read_cube", "resampling", "verify", "write_cube",
+]  # fmt: skip

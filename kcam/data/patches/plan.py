@@ -117,9 +117,13 @@ class StorePlan:
 
 def positions(shape: tuple[int, int] | tuple[int, ...], settings: Settings) -> list[tuple[int, int]]:
     """Top left corners (y, x) of the patches that fit into a picture."""
-    height, width = shape
-    rows = range(0, height - settings.size + 1, settings.stride)
-    return [(y, x) for y in rows for x in range(0, width - settings.size + 1, settings.stride)]
+    rows, columns = (starts(length, settings) for length in shape)
+    return [(y, x) for y in rows for x in columns]
+
+
+def starts(length: int, settings: Settings) -> range:
+    """Where patches start along a side of a picture."""
+    return range(0, length - settings.size + 1, settings.stride)
 
 
 def split_of(group: str, split: Sequence[tuple[str, float]]) -> str:
@@ -167,24 +171,22 @@ def make_plan(cubes: str | os.PathLike[str], settings: Settings) -> StorePlan:
     grid = min(grids, key=lambda found: (-grids[found], found))
     jobs = []
     for name, (path, source) in sources.items():
+        group = group_of(name, source.facts, settings.group)
         if tuple(np.round(source.wavelengths / nm, 4)) != grid:
             failed[name] = f"its {len(source.wavelengths)} bands are others than the {len(grid)} of most cubes here."
-            continue
-        if min(source.shape[1:]) < settings.size:
+        elif min(source.shape[1:]) < settings.size:
             failed[name] = f"it is {source.shape[1]} x {source.shape[2]}, smaller than a patch of {settings.size}."
-            continue
-        group = group_of(name, source.facts, settings.group)
-        if re.search(r"[\\\x00-\x1f\ud800-\udfff]", name + group):
+        elif re.search(r"[\\\x00-\x1f\ud800-\udfff]", name + group):
             failed[name] = f"its name {name!r} cannot be that of a file everywhere. Rename it."
-            continue
-        split, size = split_of(group, settings.split), path.stat().st_size
-        jobs.append(SceneJob(name, str(path.resolve()), group, split, source.shape, size, _fingerprint(path, size)))
+        else:
+            split, place = split_of(group, settings.split), str(path.resolve())
+            jobs.append(SceneJob(name, place, group, split, source.shape, path.stat().st_size, _fingerprint(path)))
     return StorePlan(settings, grid, tuple(sorted(jobs, key=lambda job: job.name)), failed)
 
 
-def _fingerprint(path: Path, size: int) -> str:
+def _fingerprint(path: Path) -> str:
     """Of 16 blocks of a file, its first and last among them: tells another cube of the same size without reading it."""
-    digest = hashlib.sha256()
+    size, digest = path.stat().st_size, hashlib.sha256()
     with path.open("rb") as file:
         for place in range(16):
             file.seek(max(0, size - 4096) * place // 15)

@@ -10,7 +10,7 @@ import numpy as np
 
 from kcam.data.cube import NOTHING_VALID, CubeError, Source, open_cube
 from kcam.data.patches.manifest import HEADER, sha256
-from kcam.data.patches.plan import SceneJob, Settings, StoreError, positions
+from kcam.data.patches.plan import SceneJob, Settings, StoreError, positions, starts
 from kcam.files import replacing
 
 TOP = 65535
@@ -32,7 +32,7 @@ def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, 
     with replacing(target) as temporary, temporary.open("wb") as file:
         file.write(bytes(HEADER))
         for top, values, valid in strips(source, settings):
-            for x in range(0, width - size + 1, settings.stride):
+            for x in starts(width, settings):
                 patch = values[:, :, x : x + size]
                 reason = _reason(patch, None if valid is None else valid[:, x : x + size], scale, settings)
                 if reason:
@@ -90,7 +90,7 @@ def strips(source: Source, settings: Settings) -> Iterator[tuple[int, np.ndarray
     size, (bands, height, width) = settings.size, source.shape
     values, valid = np.empty((bands, size, width), np.float32), np.empty((size, width), bool)
     last = 0
-    for top in range(0, height - size + 1, settings.stride):
+    for top in starts(height, settings):
         keep = max(0, last - top)
         for plane in (*values, valid):  # a plane at a time: numpy copies what overlaps
             plane[:keep] = plane[size - keep :]
