@@ -9,9 +9,9 @@ import typer
 from common import Json, Workers, end, progress, run, usage
 
 from kcam.data import FORMATS, PROFILES
-from kcam.data.bands import EDGES, METHODS, parse_bands
+from kcam.data.bands import EDGES, METHODS, parse_bands, profile
 from kcam.data.convert import Conversion, convert
-from kcam.data.readers import Options, profile
+from kcam.data.readers import Options
 
 
 def main(

@@ -21,7 +21,7 @@ from torch import nn
 
 from kcam import Camera, Plan, Scene, files, isp, optics, sensor
 from kcam.data import Cube, PatchDataset, Settings, extract, make_plan, read_cube, write_cube
-from kcam.data import patches as stores
+from kcam.data.patches import manifest, verify
 from kcam.plain import to_json
 from kcam.style.checkpoints import Checkpoints, _sha256
 from kcam.tradeoff import Sweep
@@ -201,7 +201,7 @@ def _put_manifest(path: Path, text: str) -> None:
     """With a digest that fits, so that it is what the manifest says that is judged."""
     try:
         document = json.loads(text)
-        document["sha256"] = stores._digest(document)
+        document["sha256"] = manifest.digest(document)
         text = json.dumps(document)
     except (ValueError, TypeError, RecursionError, AttributeError):
         pass
@@ -214,7 +214,7 @@ def _read_store(path: Path) -> None:
     if len(patches):
         assert patches[0].values.ndim == 3
         assert len(patches.position(0)) == 3
-    assert isinstance(stores.verify(path.parent), list)
+    assert isinstance(verify(path.parent), list)
 
 
 def _begun(folder: Path) -> Path:
@@ -236,7 +236,7 @@ def _go_on_from(path: Path) -> None:
     """A record that is damaged counts as none: its scene is cut again."""
     begun = path.parents[2]
     assert extract(make_plan(begun.parent / "cubes", SETTINGS), begun, resume=True).finished
-    assert stores.verify(begun) == []
+    assert verify(begun) == []
 
 
 def _cube(folder: Path) -> Path:

@@ -37,6 +37,8 @@ LAYERS = [
     {"kcam.__main__"},
 ]
 LAYER = {module: index for index, row in enumerate(LAYERS) for module in row}
+DATA = [{"cube"}, {"bands"}, {"readers", "patches"}, {"convert", "inspection", "dataset", "export"}]
+"""The same inside kcam.data: readers do not know of the store, nor the store of readers."""
 METHODS = {("kcam.camera", "kcam.planner")}
 """camera.plan(...) is a method for the user's sake, but a planner is made of cameras: imported when it is called."""
 FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath", "zarr"}
@@ -83,6 +85,16 @@ def test_imports_point_upstream(path: Path) -> None:
         if (here, there) in METHODS:
             continue
         assert there == here or LAYER[there] < LAYER[here], f"{here} imports {there}, which is downstream of it"
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "data").rglob("*.py")), ids=lambda path: path.stem)
+def test_imports_inside_data_point_upstream(path: Path) -> None:
+    row = {room: index for index, rooms in enumerate(DATA) for room in rooms}
+    here = path.relative_to(PACKAGE / "data").parts[0].removesuffix(".py")
+    for module, _ in imports(path):
+        if module.startswith("kcam.data.") and here != "__init__":
+            there = module.split(".")[2]
+            assert there == here or row[there] < row[here], f"data.{here} imports data.{there}, which is downstream"
 
 
 @pytest.mark.parametrize("path", FILES, ids=IDS)

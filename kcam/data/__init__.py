@@ -1,27 +1,13 @@
 """Spectral cubes from public data sets, and stores of patches to train on. The extras `data` and `exr` read more."""
 
-from kcam.data.bands import parse_bands, resampling
+from kcam.data.bands import PROFILES, parse_bands, resampling
 from kcam.data.cube import Cube, CubeError, write_cube
 from kcam.data.dataset import Patch, PatchDataset
 from kcam.data.export import export_patches
 from kcam.data.patches import Settings, StoreError, extract, make_plan, verify
-from kcam.data.readers import FORMATS, PROFILES, read_cube
+from kcam.data.readers import FORMATS, read_cube
 
 __all__ = [
-    "FORMATS",
-    "PROFILES",
-    "Cube",
-    "CubeError",
-    "Patch",
-    "PatchDataset",
-    "Settings",
-    "StoreError",
-    "export_patches",
-    "extract",
-    "make_plan",
-    "parse_bands",
-    "read_cube",
-    "resampling",
-    "verify",
-    "write_cube",
-]
+    "FORMATS", "PROFILES", "Cube", "CubeError", "Patch", "PatchDataset", "Settings", "StoreError", "export_patches",
+    "extract", "make_plan", "parse_bands", "read_cube", "resampling", "verify", "write_cube",
+]  # fmt: skip

@@ -1,12 +1,13 @@
-"""From one grid of wavelengths to another by a fixed matrix, and what it would have to guess."""
+"""Grids of wavelengths: their names, and from one to another by a fixed matrix, with what it would have to guess."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
+from kcam.data.cube import CubeError, Source
 from kcam.units import nm, wavelength_grid
 
 METHODS = ("pchip", "cubic")
@@ -16,6 +17,18 @@ COARSER = 1.5
 _SLACK = 0.1 * nm  # a band may lie this far outside the source without counting as a guess
 _MOST_BANDS = 10_000
 _AVERAGED = 33  # samples across a band
+CASSI_NM = (
+    453.5, 457.5, 462, 466, 471.5, 476.5, 481.5, 487, 492.5, 498, 504, 510, 516, 522.5,
+    529.5, 536.5, 544, 551.5, 558.5, 567.5, 575.5, 584.5, 594.5, 604, 614.5, 625, 636.5, 648,
+)  # fmt: skip
+"""The 28 bands of the CASSI papers: caiyuanhao1998/MST, visualization/show_simulation.m."""
+PROFILES: dict[str, np.ndarray] = {
+    "cassi28": np.asarray(CASSI_NM),
+    "cave31": np.arange(400.0, 701.0, 10.0),
+    "harvard31": np.arange(420.0, 721.0, 10.0),
+    "kaist31": np.arange(420.0, 721.0, 10.0),
+}
+"""Wavelengths [nm] that a user may name for files that hold none."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +62,13 @@ def parse_bands(text: str) -> np.ndarray:
     if not 1 <= number <= _MOST_BANDS or not (0 < first <= last) or (number > 1 and first == last):
         raise ValueError(complaint)
     return wavelength_grid(list(np.linspace(first, last, number) * nm)).numpy()
+
+
+def profile(name: str) -> np.ndarray:
+    """Wavelengths [m] of a named profile; ValueError for an unknown name."""
+    if name not in PROFILES:
+        raise ValueError(f"unknown profile {name!r}; known: {', '.join(PROFILES)}.")
+    return PROFILES[name] * nm
 
 
 def resampling(source: np.ndarray, target: np.ndarray, *, method: str = "pchip", edge: str = "error") -> Resampling:
@@ -92,6 +112,27 @@ def resampling(source: np.ndarray, target: np.ndarray, *, method: str = "pchip",
     return Resampling(matrix, outside, floored=method == "pchip")
 
 
+def resampled(source: Source, target: np.ndarray, *, method: str = "pchip", edge: str = "error") -> Source:
+    """A source on another grid of wavelengths: see `resampling`. Bands that were guessed are marked."""
+    if len(target) == len(source.wavelengths) and np.allclose(target, source.wavelengths, rtol=0, atol=1e-4 * nm):
+        return source
+    try:
+        found = resampling(source.wavelengths, target, method=method, edge=edge)
+    except ValueError as error:
+        raise CubeError(str(error)) from error
+
+    def rows(first: int, last: int) -> tuple[np.ndarray, np.ndarray | None]:
+        values, valid = source.checked_rows(first, last)
+        return found.apply(values), valid
+
+    guessed = found.extrapolated
+    if source.extrapolated is not None:  # a band that leans on a guess is one
+        guessed = guessed | (found.matrix[:, source.extrapolated] != 0).any(1)
+    facts = {**source.facts, "resampled": f"{method} from {len(source.wavelengths)} bands"}
+    shape = (len(target), *source.shape[1:])
+    return replace(source, shape=shape, wavelengths=target, rows=rows, facts=facts, extrapolated=guessed)
+
+
 def _interpolated(grid: np.ndarray, points: np.ndarray, method: str) -> np.ndarray:
     inside = np.clip(points, grid[0], grid[-1])
     if len(grid) == 1:
@@ -126,6 +167,3 @@ def band_text(wavelengths: np.ndarray) -> str:
     low, high = float(np.min(wavelengths)) / nm, float(np.max(wavelengths)) / nm
     count = len(wavelengths)
     return f"{count} band{'s' * (count != 1)}, {low:.4g} to {high:.4g} nm" if count else "no bands"
-
-
-__all__ = ["COARSER", "EDGES", "METHODS", "Resampling", "band_text", "parse_bands", "resampling"]

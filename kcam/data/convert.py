@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from kcam.data.bands import resampled
 from kcam.data.cube import SUFFIX, CubeError, words_of, write_source
-from kcam.data.readers import SUFFIXES, Options, open_source, resampled, scene_name, scenes_in
+from kcam.data.readers import SUFFIXES, open_source, scenes_in
+from kcam.data.readers.format import Options, scene_name
 
 
 @dataclass(frozen=True)
@@ -69,17 +71,14 @@ def convert(
                 report.failed[str(given)] = f"there is no scene in it: expected {known}, or a folder X_ms of PNGs."
             for path in scenes:
                 name = scene_name(path)
-                if name in jobs and path.resolve() == jobs[name].resolve():
-                    continue
-                if name in jobs:
-                    report.failed[str(path)] = f"another input is called {name} too: {jobs[name]}."
-                else:
-                    jobs[name] = path
+                first = jobs.setdefault(name, path)
+                if first is not path and first.resolve() != path.resolve():
+                    report.failed[str(path)] = f"another input is called {name} too: {first}."
         except OSError as error:
             report.failed[str(given)] = str(error)
     for path, facts in _run(list(jobs.values()), out, how, workers):
         if isinstance(facts, str):
-            report.failed[str(path)] = facts
+            report.failed[str(path)] = " ".join(facts.split())
         else:
             report.written[str(path)] = facts
         if advance:
@@ -94,9 +93,8 @@ def _run(
         for path in paths:
             yield path, convert_one(path, out, how)
         return
-    left = list(paths)
+    left, several = list(paths), list(paths)
     while left:  # a library that crashes takes its process along: what was not done is done again, one by one
-        several = left if len(left) == len(paths) else left[:1]
         with ProcessPoolExecutor(min(workers, len(several)), mp_context=get_context("spawn")) as pool:
             running = {pool.submit(convert_one, path, out, how): path for path in several}
             for future in as_completed(running):
@@ -108,15 +106,11 @@ def _run(
                     found = "reading it crashed the process: it is damaged."
                 left.remove(running[future])
                 yield running[future], found
+        several = left[:1]
 
 
 def convert_one(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
-    """One scene: its facts, or why it failed, in one line."""
-    found = _convert(path, out, how)
-    return " ".join(found.split()) if isinstance(found, str) else found
-
-
-def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
+    """One scene: its facts, or why it failed."""
     name = scene_name(path)
     try:
         options = replace(how.options, bands=how.bands)
@@ -130,10 +124,8 @@ def _convert(path: Path, out: Path, how: Conversion) -> dict[str, Any] | str:
         return str(error)
     except OSError as error:
         return f"{type(error).__name__}: {error.strerror or error}"
-    except MemoryError:
-        return "it does not fit into memory."
     except Exception as error:
-        return f"it cannot be read: {words_of(error)}"
+        return words_of(error)
 
 
 def _depth(path: Path) -> np.ndarray:

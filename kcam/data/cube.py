@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -31,6 +32,7 @@ VERSION = 1
 UNITS = ("reflectance", "radiance", "relative radiance")
 MOST_VALUES = 2**32
 """In one cube: a 31-band cube of 138 megapixels. More is taken for a damaged header."""
+_SLACK = 2**26  # bytes that a header may promise in any case
 
 
 class CubeError(ValueError):
@@ -40,14 +42,35 @@ class CubeError(ValueError):
 NOTHING_VALID = "it holds no valid pixel: all are NaN, infinite or marked as invalid."
 
 
-def words_of(error: BaseException) -> str:
-    """What a library's error says, in one line of bounded length.
+def words_of(error: Exception, what: str = "it cannot be read") -> str:
+    """What a library's error means for a cube, in one line of bounded length.
 
     Raises:    KeyboardInterrupt where that is its cause: compiled code into which Ctrl-C falls may end in SystemError.
     """
     if isinstance(error.__cause__, KeyboardInterrupt):
         raise error.__cause__
-    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
+    if isinstance(error, MemoryError):
+        return "it does not fit into memory."
+    return f"{what}: {type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
+
+
+def check_size(shape: Iterable[int], what: str = "its array") -> tuple[int, ...]:
+    """A shape as it stands in a header; CubeError for one that no cube has."""
+    sizes = tuple(int(size) for size in shape)
+    if not 1 <= prod(max(size, 0) for size in sizes) <= MOST_VALUES:
+        raise CubeError(f"{what} says it is {' x '.join(map(str, sizes))}: no cube has that size.")
+    return sizes
+
+
+def check_promise(promised: int, stored: int, what: str = "its header") -> None:
+    """CubeError where a header promises far more than its bytes can hold: no picture compresses to a 64th."""
+    if promised > 64 * stored + _SLACK:
+        raise CubeError(f"{what} promises {promised / 1e6:.0f} MB in {stored / 1e6:.3g} MB of data: it is damaged.")
+
+
+def lacking(wanted: str, names: Iterable[str]) -> CubeError:
+    """The error of a file that lacks what was asked for."""
+    return CubeError(f"it has no {wanted}, only {', '.join(names) or 'nothing'}.")
 
 
 @dataclass(frozen=True)
@@ -154,10 +177,8 @@ class Source:
                 values = np.ascontiguousarray(values, dtype=np.float32)
         except (CubeError, ImportError):
             raise
-        except MemoryError as error:
-            raise CubeError("it does not fit into memory.") from error
         except Exception as error:
-            raise CubeError(f"rows {first} to {last} cannot be read: {words_of(error)}") from error
+            raise CubeError(words_of(error, f"rows {first} to {last} cannot be read")) from error
         finite = np.isfinite(values).all(0)
         valid = finite if valid is None else valid & finite
         if valid.all():
@@ -176,22 +197,13 @@ def write_cube(path: str | os.PathLike[str], cube: Cube) -> None:
         mask = cube.mask.numpy()
         bands = np.asarray(~mask.any((1, 2)) & mask.any())
         pixels = np.asarray(mask[~bands].all(0))
-    write_source(
-        path,
-        Source(
-            cube.name or Path(path).stem,
-            cube.shape,
-            cube.wavelengths.numpy(),
-            cube.unit,
-            lambda first, last: (
-                cube.values[:, first:last].numpy(),
-                None if pixels is None else pixels[first:last],
-            ),
-            dict(cube.source),
-            bands,
-            None if cube.depth is None else cube.depth.numpy(),
-        ),
-    )
+
+    def rows(first: int, last: int) -> tuple[np.ndarray, np.ndarray | None]:
+        return cube.values[:, first:last].numpy(), None if pixels is None else pixels[first:last]
+
+    name, grid, depth = cube.name or Path(path).stem, cube.wavelengths.numpy(), cube.depth
+    depths = None if depth is None else depth.numpy()
+    write_source(path, Source(name, cube.shape, grid, cube.unit, rows, dict(cube.source), bands, depths))
 
 
 STRIP = 2**24

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from kcam.data.patches import read_manifest, scene_array
+from kcam.data.patches.manifest import read_manifest, scene_array
 from kcam.units import nm
 
 MOST_OPEN = 256

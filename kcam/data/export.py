@@ -13,16 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from kcam.data.patches import StoreError, read_manifest, scene_array
+from kcam.data.patches.manifest import read_manifest, scene_array
+from kcam.data.patches.plan import StoreError
 from kcam.files import replacing
 from kcam.units import nm
 
 
 def export_patches(
-    folder: str | os.PathLike[str],
-    path: str | os.PathLike[str],
-    *,
-    advance: Callable[[str, int], None] | None = None,
+    folder: str | os.PathLike[str], path: str | os.PathLike[str], *, advance: Callable[[str, int], None] | None = None
 ) -> int:
     """Write one split of a store as HDF5 (.h5, .hdf5; the extra `data`) or Zarr (.zarr; the extra `zarr`).
 
@@ -46,14 +44,14 @@ def export_patches(
         raise StoreError(f"{path} exists already. Use another name.")
     document = read_manifest(folder)
     records = document["scenes"]
-    count = sum(record["count"] for record in records)
+    counts = [record["count"] for record in records]
     tables: dict[str, np.ndarray] = {
-        "scale": np.repeat([record["scale"] for record in records], [record["count"] for record in records]),
-        "scene": np.repeat(np.arange(len(records), dtype=np.int32), [record["count"] for record in records]),
+        "scale": np.repeat([record["scale"] for record in records], counts),
+        "scene": np.repeat(np.arange(len(records), dtype=np.int32), counts),
         "position": np.asarray([place for record in records for place in record["positions"]], np.int32).reshape(-1, 2),
         "wavelengths": np.asarray(document["wavelengths_nm"], dtype=np.float64) * nm,
     }
-    with WRITERS[path.suffix](path, (count, *document["patch"]), tables, document) as patches:
+    with WRITERS[path.suffix](path, (sum(counts), *document["patch"]), tables, document) as patches:
         place = 0
         for record in records:
             for patch in scene_array(folder, document, record):
@@ -61,7 +59,7 @@ def export_patches(
                 place += 1
             if advance:
                 advance(record["scene"], len(records))
-    return count
+    return sum(counts)
 
 
 @contextmanager

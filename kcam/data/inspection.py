@@ -155,13 +155,8 @@ def _bad_bands(values: np.ndarray) -> list[int]:
     bad = []
     for band in range(len(values)):
         beside = [other for other in (band - 1, band + 1) if 0 <= other < len(values) and spread[other] > 0]
-        if not beside:
-            continue
-        if spread[band] == 0:
-            bad.append(band)
-            continue
-        best = max(float(np.corrcoef(values[band], values[other])[0, 1]) for other in beside)
-        if best < _UNLIKE:
+        flat = spread[band] == 0
+        if beside and (flat or max(np.corrcoef(values[band], values[other])[0, 1] for other in beside) < _UNLIKE):
             bad.append(band)
     return bad
 

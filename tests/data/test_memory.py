@@ -17,18 +17,21 @@ from stores import cube, values
 from kcam.data import PatchDataset, write_cube
 from kcam.data import cube as cube_files
 from kcam.data.cube import Source, open_cube, write_source
-from kcam.data.patches import Settings, _brightest, _strips
+from kcam.data.patches import Settings
+from kcam.data.patches.scene import brightest, strips
 from kcam.units import nm
 
 SCRIPT = """
 import json, sys
 from pathlib import Path
-from kcam.data.patches import Settings, _brightest, extract, make_plan, open_cube
+from kcam.data.cube import open_cube
+from kcam.data.patches import Settings, extract, make_plan
+from kcam.data.patches.scene import brightest
 from resident import peak
 
 start = peak()
 cubes, out = map(Path, sys.argv[1:])
-_brightest(open_cube(cubes), 256)
+brightest(open_cube(cubes), 256)
 first = peak()
 outcome = extract(make_plan(cubes, Settings(256, 128, (("train", 1.0),))), out)
 print(json.dumps({"start": start, "brightest": first, "extract": peak(), "patches": outcome.patches}))
@@ -81,14 +84,14 @@ def test_no_more_than_a_strip_is_asked_for(tmp_path: Path):
         return source.rows(first, last)
 
     watched = Source(source.name, source.shape, source.wavelengths, source.unit, rows)
-    _brightest(watched, 16)
+    brightest(watched, 16)
     assert asked[0][0] == 0
     assert asked[-1][1] == 100
     assert all(one[1] == two[0] for one, two in pairwise(asked))
     assert max(last - first for first, last in asked) <= 16
     asked.clear()
     truth = source.rows(0, 100)[0]
-    for top, strip, valid in _strips(watched, Settings(size=16, stride=6)):
+    for top, strip, valid in strips(watched, Settings(size=16, stride=6)):
         assert np.array_equal(strip, truth[:, top : top + 16])
         assert valid is None
     assert asked == [(0, 16), *((top + 10, top + 16) for top in range(6, 85, 6))]

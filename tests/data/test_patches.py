@@ -21,9 +21,10 @@ import torch
 from stores import BANDS, HEIGHT, NAMES, SETTINGS, WIDTH, call, content, cube, make_cubes, make_store, values
 
 import kcam
-from kcam.data import PatchDataset, Settings, StoreError, extract, make_plan, patches, verify, write_cube
+from kcam.data import PatchDataset, Settings, StoreError, extract, make_plan, verify, write_cube
 from kcam.data.cube import CubeError
-from kcam.data.patches import StoreStopped, group_of, parse_split, positions, read_manifest, split_of
+from kcam.data.patches import StoreStopped, group_of, parse_split, positions, read_manifest, scene, split_of
+from kcam.data.patches.manifest import digest
 
 
 @pytest.fixture(scope="module")
@@ -488,9 +489,9 @@ def test_a_full_disk_stops_and_resume_goes_on(cubes: Path, store: Path, tmp_path
     assert content(tmp_path / "out") == content(store)
 
 
-def fail_to_read(scene: str, error: Exception, patch: pytest.MonkeyPatch) -> None:
+def fail_to_read(name: str, error: Exception, patch: pytest.MonkeyPatch) -> None:
     """The rows of this scene raise an error."""
-    opened = patches.open_cube
+    opened = scene.open_cube
 
     def broken(path: Path):
         source = opened(path)
@@ -498,9 +499,9 @@ def fail_to_read(scene: str, error: Exception, patch: pytest.MonkeyPatch) -> Non
         def rows(first: int, last: int):
             raise error
 
-        return replace(source, rows=rows) if path.stem == scene else source
+        return replace(source, rows=rows) if path.stem == name else source
 
-    patch.setattr(patches, "open_cube", broken)
+    patch.setattr(scene, "open_cube", broken)
 
 
 def test_a_disk_that_cannot_be_read_fails_the_scene_alone(cubes: Path, tmp_path: Path, monkeypatch):
@@ -652,10 +653,10 @@ def test_a_scene_that_was_moved_into_the_other_split_is_found(copy: Path):
     documents["val"]["scenes"].append(record)
     shutil.move(copy / "train" / record["file"], copy / "val" / record["file"])
     for split, path in paths.items():  # by someone who knows the digest
-        path.write_text(json.dumps(documents[split] | {"sha256": patches._digest(documents[split])}))
+        path.write_text(json.dumps(documents[split] | {"sha256": digest(documents[split])}))
     assert [p for p in verify(copy) if f"the group {record['group']} stands in val and belongs to train" in p]
     documents["train"]["scenes"].insert(0, record)
-    paths["train"].write_text(json.dumps(documents["train"] | {"sha256": patches._digest(documents["train"])}))
+    paths["train"].write_text(json.dumps(documents["train"] | {"sha256": digest(documents["train"])}))
     assert [p for p in verify(copy) if f"the group {record['group']} stands in train and in val" in p]
 
 
@@ -686,7 +687,7 @@ def test_a_wrong_manifest_is_refused(copy: Path, change: dict, message: str):
     path = copy / "val" / "manifest.json"
     document = json.loads(path.read_text()) | change
     if "mean" not in change:
-        document["sha256"] = patches._digest(document)
+        document["sha256"] = digest(document)
     path.write_text(json.dumps(document))
     with pytest.raises(StoreError, match=message):
         PatchDataset(copy / "val")
@@ -697,7 +698,7 @@ def test_a_manifest_cannot_lead_out_of_its_folder(copy: Path, file: str):
     path = copy / "val" / "manifest.json"
     document = json.loads(path.read_text())
     document["scenes"][0]["file"] = file
-    path.write_text(json.dumps(document | {"sha256": patches._digest(document)}))
+    path.write_text(json.dumps(document | {"sha256": digest(document)}))
     with pytest.raises(StoreError, match="does not fit together"):
         read_manifest(copy / "val")
 

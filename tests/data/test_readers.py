@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -291,6 +293,13 @@ def test_a_missing_extra_is_named(reader: str, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setitem(sys.modules, reader, None)
     with pytest.raises(ImportError, match=r"pip install 'kcam\[(exr|data)\]'"):
         read_cube(written.path)
+
+
+def test_every_row_is_in_the_table() -> None:
+    names = [f"kcam.data.readers.{found.name}" for found in pkgutil.iter_modules(module.__path__)]
+    members = [member for name in names for member in vars(importlib.import_module(name)).values()]
+    rows = {member.name for member in members if isinstance(member, module.Format)}
+    assert rows == module.FORMATS.keys() - {"kcam"}
 
 
 def test_the_table_documents_itself() -> None:
