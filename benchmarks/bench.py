@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from benchmarks.baselines import doe_scale, per_band_render, textbook_psf_bank, transfer_functions
 from benchmarks.common import ROOT, Contestant, environment, print_table, race, write_json
 from kcam import optics, sensor
-from kcam.optics.propagation import choose
+from kcam.optics.propagation.table import choose
 from kcam.scene import Scene
 from kcam.units import mm, nm, um
 

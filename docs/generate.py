@@ -40,8 +40,8 @@ import kcam.augmentation as KC  # noqa: E402
 from benchmarks.common import save_jpeg  # noqa: E402
 from kcam import Camera, Plan, Scene, demo, optics, plots  # noqa: E402
 from kcam.data import FORMATS  # noqa: E402
-from kcam.optics.propagation import choose  # noqa: E402
-from kcam.optics.psf import Query  # noqa: E402
+from kcam.optics.propagation.question import Query  # noqa: E402
+from kcam.optics.propagation.table import choose  # noqa: E402
 from kcam.tradeoff import Row, Sweep  # noqa: E402
 from kcam.units import mm, nm, um  # noqa: E402
 
@@ -51,27 +51,6 @@ PAGES = ("docs/style.md",)
 RESULTS = ROOT / "benchmarks" / "results"
 
 # ---- the propagators -------------------------------------------------------------------------------------------------
-
-PHYSICS = {
-    "nonparaxial": "exact spheres on both sides, pupil in direction cosines",
-    "fresnel": "paraxial, equation (3.4): the thesis's model",
-    "angular_spectrum": "band-limited, from the plane behind the lens",
-    "geometric": "rays, no diffraction",
-    "reference": "float64, slow by design",
-}
-METHODS = {
-    "nonparaxial/matrix": "split matrix triple product",
-    "nonparaxial/chirp_z": "Bluestein's FFTs onto the pixels",
-    "nonparaxial/fft": "one FFT on a grid scaled to the pixels",
-    "nonparaxial/radial": "one Hankel transform",
-    "fresnel/matrix": "the same four",
-    "fresnel/chirp_z": "",
-    "fresnel/fft": "",
-    "fresnel/radial": "",
-    "angular_spectrum/fft": "FFT; an error above a grid of 8192",
-    "geometric/rays": "splatted onto the pixels",
-    "reference/quadrature": "polar quadrature; a fine grid for flat pixels",
-}
 
 
 def cases() -> dict[str, Query]:
@@ -101,16 +80,15 @@ def propagators_table() -> str:
         f"| `propagator=` | `method=` | {' | '.join(queries)} | cost |",
         "|---|---|" + "---:|" * (len(queries) + 1),
     ]
-    shown = set()
+    shown = {""}
     for row in optics.PROPAGATORS.values():
         cells = []
         for name, query in queries.items():
             error = "refuses" if row.valid_for(query) is not None else scientific(row.error(query))
             cells.append(f"**{error}**" if default[name] is row else error)
-        physics = "" if row.physics in shown else f"`{row.physics}`: {PHYSICS[row.physics]}"
-        shown.add(row.physics)
-        how = METHODS[f"{row.physics}/{row.method}"]
-        method = f"`{row.method}`" + (f": {how}" if how else "")
+        physics = "" if row.physics in shown else f"`{row.physics}`"
+        method = f"`{row.method}`" + ("" if row.about in shown else f": {row.about}")
+        shown |= {row.physics, row.about}
         lines.append(f"| {physics} | {method} | {' | '.join(cells)} | {row.cost(first) / cheapest:.0f} |")
     model = " | ".join(scientific(default[name].model_error(query)) for name, query in queries.items())
     lines.append(f"| *the reference itself, against Rayleigh-Sommerfeld* | | {model} | |")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,19 @@ from torch import Tensor, nn
 from kcam.units import wavelength_grid
 
 if TYPE_CHECKING:
-    from kcam.optics.lens import Lens
     from kcam.sensor.colour_filter import ColourFilter
+
+
+@runtime_checkable
+class Photometric(Protocol):
+    """What exposure in seconds asks of optics; None where they do not know it."""
+
+    def aperture_area(self) -> float | None:
+        """Open area of the aperture [m^2]."""
+
+    @property
+    def sensor_distance(self) -> float | Tensor | None:
+        """From the pupil to the sensor [m]."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +51,7 @@ class Context:
     illuminant: Tensor | None = None
     luminance: float = 1000.0
     generator: torch.Generator | None = None
-    lens: Lens | None = None
+    lens: Photometric | None = None
     pixel_pitch: float = 4e-6
     fill_factor: float = 1.0
     colour_filter: ColourFilter | None = None

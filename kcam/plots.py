@@ -280,7 +280,7 @@ def psf_figure(
     if not isinstance(imaging, optics.Imaging):
         fix = " Use camera[0], where its optics stand." if hasattr(imaging, "stages") else ""
         raise TypeError(f"a PSF figure is of an optics.Imaging or a Lens, got {type(imaging).__name__}.{fix}")
-    lens, pitch = imaging.lens, float(imaging.pixel_pitch)
+    lens, pitch = imaging.computed_lens(by="a PSF figure"), float(imaging.pixel_pitch)
     focus = lens.focus_distance
     if distances is None:
         distances = [1.0, 3.0, 10.0, math.inf] if not 0 < focus < 1e3 else [0.4 * focus, focus, 2.5 * focus, math.inf]
@@ -376,10 +376,12 @@ def psf_figure(
 
 def optics_text(imaging: optics.Imaging) -> str:
     """The lens and its pixels in a line."""
-    lens = imaging.lens
+    lens, pixels = imaging.lens, f"pixels of {float(imaging.pixel_pitch) / um:.3g} \u00b5m"
+    if not isinstance(lens, optics.Lens):
+        return f"{type(lens).__name__};  {pixels}"
     return (
         f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, "
-        f"in focus at {metres(lens.focus_distance)};  pixels of {float(imaging.pixel_pitch) / um:.3g} \u00b5m"
+        f"in focus at {metres(lens.focus_distance)};  {pixels}"
     )
 
 
@@ -394,7 +396,8 @@ def distance_colours(count: int) -> list[Any]:
 def _mtf(imaging: optics.Imaging, arguments: dict[str, Any], *, wavelength: float) -> tuple[Tensor, Tensor]:
     """Frequencies [1/m] up to the pixels' limit, and at each distance the contrast of optics and pixel."""
     height, width = arguments["shape"]
-    mtf = imaging.lens.mtf([wavelength], **arguments)[:, 0, height // 2, width // 2 :].detach().double().cpu()
+    lens = imaging.computed_lens(by="an MTF")
+    mtf = lens.mtf([wavelength], **arguments)[:, 0, height // 2, width // 2 :].detach().double().cpu()
     return torch.arange(mtf.shape[-1], dtype=torch.float64) / (width * float(imaging.pixel_pitch)), mtf
 
 

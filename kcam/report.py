@@ -18,7 +18,8 @@ from torch import Tensor
 
 from kcam import files, isp, optics, plots, sensor
 from kcam.camera import Camera
-from kcam.optics.pupil import Pupil
+from kcam.optics.pupil.coordinates import Pupil
+from kcam.optics.source import Points
 from kcam.plots import INK, MUTED, SMALL, TITLE, Sheet
 from kcam.scene import Scene
 from kcam.units import nm, wavelength_grid
@@ -119,7 +120,7 @@ def _label(sheet: Sheet, left: float, top: float, title: str, caption: str = "")
 
 def _draw_optics(sheet: Sheet, imaging: optics.Imaging, left: float, top: float, *, distance: float) -> float:
     """Phase map and PSFs; returns where they end."""
-    phase = _doe_phase(imaging.lens)
+    phase = _doe_phase(imaging.lens) if isinstance(imaging.lens, optics.Lens) else None
     if phase is not None:
         span, largest = float(np.nanmax(phase) - np.nanmin(phase)), float(np.nanmax(np.abs(phase)))
         wrapped = largest > math.pi
@@ -128,17 +129,9 @@ def _draw_optics(sheet: Sheet, imaging: optics.Imaging, left: float, top: float,
         _label(sheet, left, top, "DOE phase", caption if largest > 1e-6 else "flat")
         sheet.picture(_coloured("twilight_shifted", phase), left, top, PANEL, PANEL, smooth=False)
         left += PANEL + APART
-    psf = imaging.lens.psf(
-        list(PSF_WAVELENGTHS),
-        distances=distance,
-        pixel_pitch=float(imaging.pixel_pitch),
-        shape=imaging.psf_shape or (255, 255),
-        propagator=imaging.propagator,  # type: ignore[arg-type]
-        method=imaging.method,
-        samples=imaging.samples,
-        fill_factor=imaging.fill_factor,
-        integrate=imaging.integrate,
-    )[0]
+    pixels = imaging.pixels(imaging.psf_shape or (255, 255), torch.empty(0))
+    points = Points(torch.tensor([1 / distance], dtype=torch.float64))
+    psf = imaging.lens.bank(points, torch.tensor(PSF_WAVELENGTHS, dtype=torch.float64), pixels, **imaging.recipe)[0]
     psf = psf.double().cpu()
     psf = plots.centre(psf, plots.reach_of(psf[None], share=plots.SHARE_SHOWN))
     light = plots.percent_or_more(float(psf.sum((-2, -1)).min()))

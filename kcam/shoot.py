@@ -107,6 +107,8 @@ def check_not_too_near(imaging: optics.Imaging, distance: float, *, shape: tuple
     The blur is the shadow of the aperture, D d (1 / z - 1 / z_focus) wide; inside the focal length no image is real.
     """
     lens = imaging.lens
+    if not isinstance(lens, optics.Lens):  # of measured PSFs no aperture is known, nor need there be one
+        return
     width = 2 * float(lens.aperture.semi_aperture().detach())
     per_vergence = width * float(lens.sensor_distance) / imaging.pixel_pitch  # pixels per 1/m
     side = min(*shape, *(imaging.psf_shape or ()))

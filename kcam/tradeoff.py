@@ -26,10 +26,12 @@ from torch.nn import functional as F
 from kcam import isp, measure, sensor, threads
 from kcam.camera import Camera
 from kcam.optics import PROPAGATORS, Imaging
-from kcam.optics.propagation import PHYSICS, Propagator, choose
-from kcam.optics.psf import Query, samples_by_rule
-from kcam.optics.reference import Convergence, checked_psf
-from kcam.optics.textbook import textbook_angular_spectrum_row, textbook_row
+from kcam.optics.propagation.grid import samples_by_rule
+from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.reference import Convergence, checked_psf
+from kcam.optics.propagation.row import Propagator
+from kcam.optics.propagation.table import PHYSICS, choose
+from kcam.optics.propagation.textbook import textbook_angular_spectrum_row, textbook_row
 from kcam.plain import from_json
 from kcam.planner.plan import ENDS, with_imaging
 from kcam.scene import Scene
@@ -354,7 +356,7 @@ def _query(imaging: Imaging, scene: Scene) -> Query:
     """What a bank of PSFs of this scene asks for: at its nearest and its farthest point."""
     vergences = _vergences(scene)
     window = imaging.psf_window(scene.wavelengths, vergences=vergences, picture=scene.shape[1:])
-    return imaging.lens.query(
+    return imaging.computed_lens(by="kcam tradeoff").query(
         scene.wavelengths,
         distances=1 / vergences,
         pixel_pitch=imaging.pixel_pitch,
@@ -375,13 +377,7 @@ def _sample_counts(imaging: Imaging, scene: Scene, kappas: Sequence[float]) -> l
     """Pupil samples that each kappa gives at the shortest wavelength, ascending."""
     query = _query(imaging, scene)
     shortest = int(query.wavelengths.argmin())
-    spread, wavelength = float(query.displacement[shortest]), float(query.wavelengths[shortest])
-    return sorted(
-        {
-            samples_by_rule(replace(query, kappa=kappa, samples=None), displacement=spread, wavelength=wavelength)
-            for kappa in kappas
-        }
-    )
+    return sorted({samples_by_rule(replace(query, kappa=kappa, samples=None), shortest) for kappa in kappas})
 
 
 # ---- the measurement -------------------------------------------------------------------------------------------------
@@ -462,7 +458,7 @@ class _Truth:
         seconds = time.process_time() - start
         count = _sample_counts(imaging, scene, [REFERENCE_KAPPA])[0]
         # the Hankel form has no pupil grid, and no error of one
-        finely = {} if imaging.lens.symmetric else {"samples": count}
+        finely = {} if imaging.computed_lens(by="kcam tradeoff").symmetric else {"samples": count}
         fine = with_imaging(camera, propagator="nonparaxial", method=None, **finely)
         double = scene.to(dtype=torch.float64)
         bank = _imaging(fine).psf_bank(query.wavelengths, vergences=query.vergences, shape=whole.shape, like=psfs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ METHODS = {("kcam.camera", "kcam.planner")}
 """camera.plan(...) is a method for the user's sake, but a planner is made of cameras: imported when it is called."""
 FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath", "zarr"}
 """Not among the core dependencies: the library needs none of them at import, nor at run time."""
-LAZY = {"kcam.data": {"h5py", "cv2", "zarr"}}
+LAZY = {"kcam.data": {"h5py", "cv2", "zarr"}, "kcam.optics": {"h5py"}}
 
 
 def part(path: Path) -> str:
@@ -51,8 +52,11 @@ def part(path: Path) -> str:
     return f"kcam.{path.relative_to(PACKAGE).parts[0].removesuffix('.py')}"
 
 
-def imports(path: Path) -> list[tuple[str, bool]]:
-    """(module, whether only for the type checker) for each import in a file, `from kcam import x` as kcam.x."""
+def imports(path: Path, *, members: bool = False) -> list[tuple[str, bool]]:
+    """(module, whether only for the type checker) for each import in a file, `from kcam import x` as kcam.x.
+
+    members: every `from a import b` as a.b, which may be a module too.
+    """
     tree = ast.parse(path.read_text())
     typing_only = {
         id(node)
@@ -66,7 +70,8 @@ def imports(path: Path) -> list[tuple[str, bool]]:
             found += [(alias.name, id(node) in typing_only) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: write imports in full, from kcam.x import y"
-            names = [f"kcam.{alias.name}" for alias in node.names] if node.module == "kcam" else [node.module]
+            whole = members or node.module == "kcam"
+            names = [f"{node.module}.{alias.name}" for alias in node.names] if whole else [node.module]
             found += [(name, id(node) in typing_only) for name in names if name]
     return found
 
@@ -85,6 +90,31 @@ def test_imports_point_upstream(path: Path) -> None:
         if (here, there) in METHODS:
             continue
         assert there == here or LAYER[there] < LAYER[here], f"{here} imports {there}, which is downstream of it"
+
+
+# The house of optics: a room imports from rooms below it and from its own, and no module from one that needs it, even
+# if only for the type checker.
+FLOORS = ["autograd", "numerics", "source", "regions", "pupil", "elements", "propagation", "lens"]
+FLOORS += ["measured", "rendering", "imaging", "__init__"]
+
+
+def test_optics_is_a_house_with_floors() -> None:
+    optics = PACKAGE / "optics"
+    modules = {}
+    for path in optics.rglob("*.py"):
+        name = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+        modules[name.removesuffix(".__init__") if path.parent != optics else name] = path
+    needs: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        here = name.split(".")[2]
+        assert here in FLOORS, f"{name} is new: give it a floor"
+        found = {module for module, _ in imports(path, members=True) if module.startswith("kcam.optics.")}
+        needs[name] = {module if module in modules else module.rpartition(".")[0] for module in found} - {name}
+        for module in found:
+            there = module.split(".")[2]
+            assert FLOORS.index(there) <= FLOORS.index(here), f"{name} imports {module}, which is above it"
+    order = TopologicalSorter(needs)
+    order.prepare()  # raises CycleError, which names the modules
 
 
 @pytest.mark.parametrize("path", sorted((PACKAGE / "data").rglob("*.py")), ids=lambda path: path.stem)

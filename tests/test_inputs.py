@@ -24,7 +24,7 @@ import kcam
 import kcam.augmentation as KC
 from kcam import Camera, Scene, isp, optics, plots, sensor, style
 from kcam.inputs import check_bands, check_picture, check_signal, describe
-from kcam.optics.imaging import alike
+from kcam.optics.rendering.depth import alike
 from kcam.units import mm, um
 from tests.augmentation.augmented_cases import LENS, small_camera
 
@@ -552,7 +552,7 @@ def test_equal_distances_share_a_psf(monkeypatch: pytest.MonkeyPatch) -> None:
     bank = optics.Imaging._grouped_bank
 
     def counted(self: optics.Imaging, wavelengths: Tensor, **how: Any) -> Tensor:
-        asked.append(how["vergences"].numel())
+        asked.append(how["points"].vergences.numel())
         return bank(self, wavelengths, **how)
 
     monkeypatch.setattr(optics.Imaging, "_grouped_bank", counted)

@@ -16,7 +16,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from kcam import Camera, cli, demo, isp, optics, plots, sensor, tradeoff
-from kcam.optics import reference
+from kcam.optics.propagation import reference
 from kcam.scene import Scene
 from kcam.tradeoff import Row, Sweep
 from kcam.units import mm, um, wavelength_grid

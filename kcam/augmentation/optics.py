@@ -13,8 +13,9 @@ from kcam.augmentation.base import CameraAugmentation, check_inverse_depth, per_
 from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
 from kcam.compiled import uncompiled
 from kcam.optics import batch_psf, refractive_index
-from kcam.optics.convolution import Convolution, Renderer
-from kcam.optics.imaging import Layers, layer_shares
+from kcam.optics.rendering.convolution import Convolution
+from kcam.optics.rendering.depth import Layers, layer_shares
+from kcam.optics.rendering.renderer import Renderer
 from kcam.units import check_length, check_pixel_pitch, mm, nm, um, wavelength_grid
 
 DESIGN = 550 * nm

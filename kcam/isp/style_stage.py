@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal, remedy
-from kcam.optics.transforms import fast_length
+from kcam.optics.numerics import fast_length
 from kcam.precision import full_precision
 from kcam.ste import clip_ste
 

@@ -1,6 +1,5 @@
 """Wave optics: from a point of light to its image on the sensor, and from a scene to the light in each pixel."""
 
-from kcam.optics.batch import batch_psf
 from kcam.optics.elements import (
     DOE,
     AnnularAperture,
@@ -15,10 +14,13 @@ from kcam.optics.elements import (
     ZernikeAberration,
     ZernikeDOE,
 )
+from kcam.optics.elements.materials import GLASSES, refractive_index
 from kcam.optics.imaging import Imaging
 from kcam.optics.lens import Lens
-from kcam.optics.materials import GLASSES, refractive_index
-from kcam.optics.propagation import PROPAGATORS
+from kcam.optics.measured import MeasuredPSF
+from kcam.optics.propagation import textbook
+from kcam.optics.propagation.batch import batch_psf
+from kcam.optics.propagation.table import PROPAGATORS
 
 __all__ = [
     "DOE",
@@ -31,6 +33,7 @@ __all__ = [
     "Element",
     "Imaging",
     "Lens",
+    "MeasuredPSF",
     "PlanoConvexLens",
     "RadialDOE",
     "SquareAperture",
@@ -39,4 +42,5 @@ __all__ = [
     "ZernikeDOE",
     "batch_psf",
     "refractive_index",
+    "textbook",
 ]

@@ -2,18 +2,18 @@
 
     I_c = sum_z,l kappa_cl (I_zl * h_zl)
 
-How the picture is convolved stands in `convolution`; here is which PSFs, for which layers of depth.
+How the picture is convolved stands in `rendering`; here is which PSFs, for which layers of depth.
 """
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 import warnings
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -22,31 +22,40 @@ from kcam.cache import ValueCache, differentiated
 from kcam.context import Context, Stage
 from kcam.effects import Work
 from kcam.inputs import check_bands, describe
-from kcam.optics.convolution import BORDERS, Renderer, rendering_work
-from kcam.optics.lens import Lens
-from kcam.optics.propagation import PHYSICS, Propagator, choose
-from kcam.optics.psf import Query, samples_by_rule
-from kcam.optics.sampling import KAPPA
+from kcam.optics.lens import Lens, Recipe
+from kcam.optics.propagation.row import Propagator
+from kcam.optics.propagation.sampling import KAPPA
+from kcam.optics.propagation.table import PHYSICS
+from kcam.optics.regions import field_shares, pixel_positions
+from kcam.optics.rendering.borders import BORDERS
+from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, layer_shares
+from kcam.optics.rendering.renderer import Renderer
+from kcam.optics.source import Defocus, PixelGrid, Points, PSFSource
 from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
-if TYPE_CHECKING:
-    from kcam.sensor.colour_filter import ColourFilter
-
 OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
-LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
 COVERAGES = ("channel", "band")
 _RANGE = 4000.0  # of light in one picture that float32's transforms hold to 1e-3; a picture of 8 bits has 3300
 _FEW_BRIGHT, _MUCH_DARK = 0.05, 0.01  # shares of the pixels
-_COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
+
+
+class Absorber(Protocol):
+    """What `Imaging` lets absorb its bands inside the transform: a `sensor.ColourFilter`."""
+
+    def contraction(self, wavelengths: Tensor) -> Tensor:
+        """Weights (C, L) of the bands in each channel."""
+
+    def finish(self, light: Tensor) -> Tensor:
+        """What the filter makes of the channels' light (B, C, H, W)."""
 
 
 class Imaging(Stage):
     """The light of a scene through a lens onto the pixels.
 
     Args:
-        lens: the optics.
+        lens: the optics: a `Lens`, a `MeasuredPSF`, or anything that follows `source.PSFSource`.
         pixel_pitch: [m]. fill_factor: light-sensitive share of a pixel; the irradiance is its mean over that square,
             and an even scene gives the same whatever the share.
         propagator, method, samples: as in `Lens.psf`. A number of samples freezes the pupil grid, which otherwise
@@ -68,7 +77,7 @@ class Imaging(Stage):
         direct: convolve in the picture, without a Fourier transform: faster for small windows, with the same result.
     What follows are shortcuts, with errors that a `Plan` weighs:
         blur: False lets each point light its own pixel only.
-        kappa: pupil samples per fringe, see `optics.sampling.pupil_samples`; None for its default.
+        kappa: pupil samples per fringe, see `optics.propagation.sampling.pupil_samples`; None for its default.
         renormalise: give a PSF that psf_shape cuts its whole light again.
         occlusion: False adds the layers up, also where a nearer one hides a farther one.
         rank: of the scene's spectra, at most, see `Scene.low_rank`; None for its own.
@@ -80,7 +89,7 @@ class Imaging(Stage):
 
     def __init__(
         self,
-        lens: Lens,
+        lens: PSFSource,
         *,
         pixel_pitch: float = 4e-6,
         propagator: str | Propagator = "nonparaxial",
@@ -106,8 +115,8 @@ class Imaging(Stage):
         precision: str | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(lens, Lens):
-            raise TypeError(f"Imaging takes an optics.Lens, got {type(lens).__name__}.")
+        if not isinstance(lens, PSFSource):
+            raise TypeError(f"Imaging takes an optics.Lens or another source of PSFs, got {type(lens).__name__}.")
         if not isinstance(propagator, Propagator) and propagator not in PHYSICS:
             raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
         if border not in BORDERS:
@@ -148,9 +157,7 @@ class Imaging(Stage):
         self.occlusion, self.rank, self.precision = occlusion, rank, precision
         self._warns = True  # of too few layers
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
-        query = self._query(wavelength_grid([550e-9]), torch.zeros(1), self.psf_shape or (1, 1), torch.empty(0))
-        if method is not None:
-            choose(query, propagator=propagator, method=method)  # refuses a method that does not exist
+        self._check_recipe()
 
     def changed(self, **arguments: Any) -> Imaging:
         """The same stage with some of its constructor's arguments changed; it shares the lens and has kept nothing.
@@ -162,12 +169,28 @@ class Imaging(Stage):
         changed._warns = self._warns and "layers" not in arguments
         return changed
 
+    def _check_recipe(self) -> None:
+        """What asks for a method that does not exist, or for one where nothing is computed, is refused at once."""
+        if isinstance(self.lens, Lens):
+            pixels = self.pixels(self.psf_shape or (1, 1), torch.empty(0))
+            query = self.lens.question(Points(torch.zeros(1)), wavelength_grid([550e-9]), pixels, **self.recipe)
+            if self.method is not None:
+                self.recipe["recipe"].row(query)
+            return
+        given = {"propagator": self.propagator != "nonparaxial"}
+        given |= {name: getattr(self, name) is not None for name in ("method", "samples", "kappa")}
+        if any(given.values()):
+            names = ", ".join(f"{name}=" for name, value in given.items() if value)
+            raise ValueError(
+                f"{names} says how a Lens computes its PSFs; a {type(self.lens).__name__} has them. Leave it out."
+            )
+
     def provides(self) -> dict[str, Any]:
         """The optics, for exposure in physical units."""
         return {"lens": self.lens, "pixel_pitch": self.pixel_pitch, "fill_factor": self.fill_factor}
 
     def forward(
-        self, scene: Scene | Tensor, context: Context | None = None, *, colour_filter: ColourFilter | None = None
+        self, scene: Scene | Tensor, context: Context | None = None, *, colour_filter: Absorber | None = None
     ) -> Tensor:
         """Mean irradiance over each pixel.
 
@@ -183,28 +206,20 @@ class Imaging(Stage):
         if self.rank is not None and self.rank < scene.coefficients.shape[1]:
             scene = scene.low_rank(self.rank)
         planes = scene.coefficients
-        working = self._working(scene)
+        working = self.working(scene)
         contraction = None if colour_filter is None else colour_filter.contraction(scene.wavelengths)
         with full_precision(working.device):
             result = self._render(scene, working, contraction).to(planes.dtype)
         return result if colour_filter is None else colour_filter.finish(result)
 
     def psf_window(self, wavelengths: Tensor, *, vergences: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-        """Window of the PSF in pixels: at most 0.1 % of the light outside, or the window is the picture.
-
-        Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a
-        rim of length P around an area A spreads beyond a radius. Profiles of rings scatter light beyond their rays:
-        then the blur holds all but a tenth of the share.
-        """
+        """Window of the PSF in pixels: at most 0.1 % of the light outside, or the window is the picture."""
         if not self.blur:
             return 1, 1
         if self.psf_shape is not None:
             return self.psf_shape
-        query = self._query(wavelengths, vergences, (1, 1), torch.empty(0, dtype=torch.float64))
-        blur = float((query.spread(OUTSIDE_SHARE / 10) + self.lens.pixel_phase_displacement(query)).max())
-        tail = float(wavelengths.max()) * float(query.sensor_distance.detach()) / (2 * math.pi**2 * OUTSIDE_SHARE)
-        half = math.ceil((blur + tail * self.lens.aperture.rim_per_area()) / self.pixel_pitch)
-        height, width = (min(2 * half + 1, n + (n + 1) % 2) for n in picture)
+        window = self.lens.window(Points(vergences), wavelengths, self.pixels((1, 1), torch.empty(0)))
+        height, width = (min(side, n + (n + 1) % 2) for side, n in zip(window, picture, strict=True))
         return height, width
 
     def depth_layers(self, depth: Tensor, wavelengths: Tensor, *, waves: float = LAYER_WAVES) -> Tensor:
@@ -226,20 +241,20 @@ class Imaging(Stage):
             return vergence.mean()[None] if differentiated(vergence) else low[None]
         if isinstance(self.layers, tuple):
             return 1 / torch.tensor(self.layers, dtype=torch.float64, device=vergence.device)
+        nodes = getattr(self.lens, "vergences", None)
+        if nodes is not None and self.layers is None:  # between them PSFs are linear, as shares of layers are
+            nodes = nodes.to(vergence.device)
+            return torch.cat([low[None], nodes[(nodes > low.detach()) & (nodes < high.detach())], high[None]])
         count = self.layers
         if count is None:
-            count = 1 + math.ceil(span * self._waves(wavelengths) / waves)
-            own = None if differentiated(vergence) else _few_values(vergence, at_most=count)
+            count = 1 + math.ceil(span * self.lens.defocus_waves(wavelengths) / waves)
+            own = None if differentiated(vergence) else few_values(vergence, at_most=count)
             if own is not None:
                 return own
         if count == 1:
             return (low + high)[None] / 2
         share = torch.linspace(0, 1, count, dtype=torch.float64, device=vergence.device)
         return low + (high - low) * share
-
-    def _waves(self, wavelengths: Tensor) -> float:
-        """Of defocus at the rim for each unit of vergence, at most [m]."""
-        return float(self.lens.aperture.semi_aperture().detach()) ** 2 / (2 * float(wavelengths.min()))
 
     def _check_layers(self, vergence: Tensor, layers: Tensor, wavelengths: Tensor) -> None:
         """Warn where a pixel's distance is farther from all given layers than from the next of the rule's."""
@@ -248,7 +263,7 @@ class Imaging(Stage):
         nodes, vergence = layers.detach(), vergence.detach().contiguous()
         after = torch.searchsorted(nodes, vergence).clamp(max=len(nodes) - 1)
         away = torch.minimum((nodes[after] - vergence).abs(), (vergence - nodes[(after - 1).clamp(min=0)]).abs())
-        worst = float(away.max()) * self._waves(wavelengths)
+        worst = float(away.max()) * self.lens.defocus_waves(wavelengths)
         if worst > LAYER_WAVES / 2 * (1 + 1e-6):
             distance = float(1 / vergence.flatten()[away.argmax()])
             warnings.warn(
@@ -263,37 +278,43 @@ class Imaging(Stage):
     def _as_scene(self, bands: Tensor, context: Context) -> Scene:
         check_bands(bands, name="bands", count=context.wavelengths.numel(), ndims=(4,), sure=False)
         distance = self.distance if self.distance is not None else self.lens.focus_distance
-        if not distance > 0:
-            raise ValueError(
-                f"the lens is focused on {distance:g} m, behind itself; say where the bands are: Imaging(distance=2.0)."
-            )
+        if distance is None or not distance > 0:
+            place = "nobody knows where" if distance is None else f"{distance:g} m, behind itself"
+            raise ValueError(f"the lens is focused on {place}; say where the bands are: Imaging(distance=2.0).")
         light = {} if context.illuminant is None else {"illuminant": context.illuminant}
         return Scene.from_bands(
             bands, wavelengths=context.wavelengths, depth=distance, luminance=context.luminance, **light
         )
 
-    def _query(self, wavelengths: Tensor, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Query:
-        vergences = vergences.to(torch.float64)
-        query = self.lens.query(
-            wavelengths,
-            distances=1 / vergences.detach(),
-            pixel_pitch=self.pixel_pitch,
-            shape=shape,
-            samples=self.samples,
-            fill_factor=self.fill_factor,
-            integrate=self.integrate,
-            dtype=like.dtype,
-            device=like.device,
-        )
-        if differentiated(vergences):  # not through 1 / distance, which has no slope at infinity
-            query = replace(query, vergences=vergences.to(query.device))
-        return query if self.kappa is None else replace(query, kappa=self.kappa)
+    def pixels(self, shape: tuple[int, int], like: Tensor) -> PixelGrid:
+        """The pixels of a window of PSFs, in the dtype and on the device of `like`."""
+        return PixelGrid(self.pixel_pitch, shape, self.fill_factor, self.integrate, like.dtype, like.device)
+
+    @property
+    def recipe(self) -> dict[str, Recipe]:
+        """What only optics that compute their PSFs are told."""
+        if not isinstance(self.lens, Lens):
+            return {}
+        return {"recipe": Recipe(self.propagator, self.method, self.samples, self.kappa)}
+
+    def computed_lens(self, *, by: str) -> Lens:
+        """The lens, for what asks it more than PSFs. Raises: ValueError, which says `by` whom, where there is none."""
+        if not isinstance(self.lens, Lens):
+            raise ValueError(
+                f"{by} takes a camera with an optics.Lens, which computes its PSFs; this one has a "
+                f"{type(self.lens).__name__}."
+            )
+        return self.lens
+
+    def defocus(self, wavelengths: Tensor) -> Defocus:
+        """How far light that is out of focus goes."""
+        return self.lens.defocus(wavelengths, self.pixel_pitch) if self.blur else Defocus()
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the bands of a scene, (Z, L, h, w) in the dtype and on the device of `like`; kept while nothing
         changes. The caller's own: it may be changed in place.
         """
-        psfs = self._grouped_bank(wavelengths, vergences=vergences, shape=shape, like=like)
+        psfs = self._grouped_bank(wavelengths, points=Points(vergences), shape=shape, like=like)
         owner = self._groups(wavelengths)
         return psfs.clone() if owner is None else psfs[:, owner.to(psfs.device)]
 
@@ -315,25 +336,21 @@ class Imaging(Stage):
         sums = wavelengths.new_zeros(int(owner.max()) + 1).index_add_(0, owner, wavelengths)
         return sums / owner.bincount()
 
-    def _grouped_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
+    def _grouped_bank(self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the groups of bands that share one, (Z, G, h, w)."""
         if not self.blur:
-            return like.new_ones(len(vergences), 1, 1, 1)
-        query = self._query(self._psf_wavelengths(wavelengths), vergences, shape, like)
+            return like.new_ones(len(points.vergences), 1, 1, 1)
 
         def build() -> Tensor:
-            row = choose(query, propagator=self.propagator, method=self.method)
-            psfs = row(query)
-            if query.active < 1 and not self.renormalise:
-                # a scene's pixel is a point here: a sensitive part that it hits or misses would gain or lose its light
-                whole = row(replace(query, active=1.0)).sum((-2, -1), keepdim=True)
-                psfs = psfs / psfs.sum((-2, -1), keepdim=True) * whole
+            pixels = self.pixels(shape, like)
+            psfs = self.lens.bank(points, self._psf_wavelengths(wavelengths), pixels, **self.recipe)
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.renormalise else psfs
 
         # the whole stage, lens and all: what the PSFs depend on is not listed by hand
-        return self._bank_cache.get((self, wavelengths, vergences, shape, like.dtype, like.device), build)
+        where = (points.vergences, points.positions)
+        return self._bank_cache.get((self, wavelengths, where, shape, like.dtype, like.device), build)
 
-    def _working(self, scene: Scene) -> Tensor:
+    def working(self, scene: Scene) -> Tensor:
         """The scene's planes in the type that is computed in: at least float32."""
         planes = scene.coefficients
         if self.precision is not None:
@@ -342,15 +359,17 @@ class Imaging(Stage):
             return planes.double()
         return planes.float()
 
-    def _vergences(self, scene: Scene, depth: Tensor) -> Tensor:
-        """Of the layers: half as far apart where a few lights stand out, whose own blur is seen, not its mean."""
+    def vergences(self, scene: Scene, depth: Tensor) -> Tensor:
+        """Of the layers that a scene is cut into, (Z,): half as far apart where a few lights stand out, whose own blur
+        is seen, not its mean.
+        """
         fine = depth.numel() > 1 and wide_range(scene)
         return self.depth_layers(depth, scene.wavelengths, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
 
-    def _layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
+    def layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vergences of the layers in which there is anything, and the share of each pixel in them; None for one."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
-        vergences = self._vergences(scene, depth)
+        vergences = self.vergences(scene, depth)
         if depth.ndim == 1 and len(depth) > 1:
             return vergences, None
         self._check_layers(1 / depth, vergences, scene.wavelengths)
@@ -369,7 +388,7 @@ class Imaging(Stage):
         if len(apart := alike(scene)) > 1:
             works = [self.work(scene.samples(rows), channels=channels) for rows in apart]
             return sum(works[1:], works[0])
-        planes = self._working(scene)
+        planes = self.working(scene)
         batch, count, height, width = planes.shape
         bands, factored = scene.wavelengths.numel(), scene.spectra is not None
         low_rank = self.rank is not None and self.rank < count
@@ -377,41 +396,35 @@ class Imaging(Stage):
         if low_rank and self.rank is not None:
             touched = float(batch * height * width * count * (count / 8 + self.rank))
             first, count, factored = Work({"touch": touched}, planes.element_size() * touched / count), self.rank, True
-        vergences, _ = self._layers_of(scene, planes)
+        vergences, _ = self.layers_of(scene, planes)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
         channels = None if layers > 1 and self._per_band else channels
         grouped = self._psf_wavelengths(scene.wavelengths)
         groups = len(grouped)
-        rendering = rendering_work(
-            (height, width),
-            window,
-            planes=count,
-            factored=factored,
-            bands=bands,
-            groups=groups,
-            channels=channels,
-            border=self.border,
-            direct=self.direct,
-            tile=self.tile,
-            itemsize=itemsize,
-            max_memory=self.max_memory,
-            coverage=layers > 1 and self.occlusion,
+        shaped = functools.partial(planes.new_empty, device="meta")
+        renderer = Renderer(
+            shaped(1, groups, *window),
+            spectra=shaped(count, bands) if factored else None,
+            weights=None if channels is None else shaped(channels, bands),
+            **self._rendering(scene),
         )
+        rendering = renderer.work(coverage=layers > 1 and self.occlusion)
         scale = itemsize / 4  # twice as many bytes take twice as long
         operations = {kind: number * layers * batch * scale for kind, number in rendering.operations.items()}
         operations["layer"] = float(layers)
         bank = 0.0
         if self.blur:
-            query = self._query(grouped, vergences, window, planes)
-            row = choose(query, propagator=self.propagator, method=self.method)
             at_once = min(layers, self._layers_at_once(bands, window, planes))
-            operations |= {row.method: row.cost(query) * scale, "bank": float(math.ceil(layers / at_once))}
-            operations["psf"] = float(layers * groups)
-            if self.lens.has_pixel_phase:
-                operations["map"] = _map_work(query)
+            operations |= {"bank": float(math.ceil(layers / at_once)), "psf": float(layers * groups)}
+            if isinstance(self.lens, Lens):
+                pixels = self.pixels(window, planes)
+                operations |= self.lens.operations(Points(vergences), grouped, pixels, **self.recipe)
             bank = float(2 * at_once * groups * window[0] * window[1] * itemsize)
         shares = float(layers * height * width * batch * 16) if layers > 1 else 0.0
+        positions = getattr(self.lens, "positions", None)
+        zones = 1 if positions is None else len(positions)
+        operations = {kind: count * zones for kind, count in operations.items()}
         return first + Work(operations, rendering.memory * batch + bank + shares)
 
     # ---- rendering -------------------------------------------------------------------------------------------------
@@ -427,33 +440,42 @@ class Imaging(Stage):
             return torch.cat(parts)[torch.cat(groups).argsort().to(planes.device)]
         spectra = None if scene.spectra is None else scene.spectra.to(planes)
         weights = None if contraction is None else contraction.to(planes)
-        vergences, shares = self._layers_of(scene, planes)
+        vergences, shares = self.layers_of(scene, planes)
         afterwards = None
         if shares is not None and self._per_band:
             weights, afterwards = None, weights
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         length = self._layers_at_once(bands, window, planes)
-        layers = Layers(planes, shares, occlusion=self.occlusion)
-        for start in range(0, vergences.numel(), length):
-            some = vergences[start : start + length]
-            psfs = self._grouped_bank(scene.wavelengths, vergences=some, shape=window, like=planes)
-            renderer = Renderer(
-                psfs,
-                owner=self._groups(scene.wavelengths),
-                spectra=spectra,
-                weights=weights,
-                picture=(height, width),
-                border=self.border,
-                direct=self.direct,
-                tile=self.tile,
-                max_memory=self.max_memory,
-                cache=self._transfer_cache,
-            )
-            layers.add(renderer, first=start)
-        light = layers.light
+        light = planes.new_zeros(())
+        for position, own in self._zones(planes):
+            layers = Layers(own, shares, occlusion=self.occlusion)
+            for start in range(0, vergences.numel(), length):
+                points = Points(vergences[start : start + length], position)
+                psfs = self._grouped_bank(scene.wavelengths, points=points, shape=window, like=planes)
+                renderer = Renderer(psfs, spectra=spectra, weights=weights, **self._rendering(scene))
+                layers.add(renderer, first=start)
+            light = layers.light if position is None else light + layers.light
         if afterwards is not None:
             light, weights = torch.einsum("cl,blyx->bcyx", afterwards, light), afterwards
         return _not_negative(light, weights)
+
+    def _zones(self, planes: Tensor) -> Iterator[tuple[Tensor | None, Tensor]]:
+        """Positions on the sensor (1, 2) [m] at which the optics know their PSFs, and what of the light falls there."""
+        positions = getattr(self.lens, "positions", None)
+        if positions is None:
+            yield None, planes
+            return
+        picture = (planes.shape[-2], planes.shape[-1])
+        shares = field_shares(positions, pixel_positions(picture, self.pixel_pitch)).to(planes)
+        for position, share in zip(positions, shares.unbind(-1), strict=True):
+            if bool(share.any()):
+                yield position[None], planes * share
+
+    def _rendering(self, scene: Scene) -> dict[str, Any]:
+        """What a `Renderer` is told beside its tensors."""
+        own = {name: getattr(self, name) for name in ("border", "direct", "tile", "max_memory")}
+        owner, cache = self._groups(scene.wavelengths), self._transfer_cache
+        return own | {"picture": tuple(scene.shape[-2:]), "owner": owner, "cache": cache}
 
     @property
     def _per_band(self) -> bool:
@@ -514,89 +536,3 @@ def _count_or_distances(layers: int | Sequence[float] | Tensor) -> int | tuple[f
     for distance in found.tolist():
         check_distances(distance)
     return tuple(sorted(set(found.tolist()), reverse=True))
-
-
-def _few_values(values: Tensor, *, at_most: int) -> Tensor | None:
-    """The different values, ascending, or None where there are more of them."""
-    flat = values.flatten()
-    sample = flat[:: max(1, flat.numel() // 4096)]  # tells a ramp from planes without sorting all pixels
-    if sample.unique().numel() > at_most:
-        return None
-    found = flat.unique()
-    return found if found.numel() <= at_most else None
-
-
-def alike(scene: Scene) -> list[Tensor]:
-    """Rows of a batch at one distance each, in the order in which distances come first; one list for all but (B,).
-
-    Where a derivative passes through the distances each sample is alone: one PSF for two would share it out.
-    """
-    depth, batch = scene.depth, scene.shape[0]
-    if not isinstance(depth, Tensor) or depth.ndim != 1 or batch < 2:
-        return [torch.arange(batch)]
-    if differentiated(depth):
-        return list(torch.arange(batch)[:, None])
-    groups: dict[float, list[int]] = {}
-    for row, distance in enumerate(depth.tolist()):
-        groups.setdefault(distance, []).append(row)
-    return [torch.tensor(rows) for rows in groups.values()]
-
-
-def _map_work(query: Query) -> float:
-    """Pixels of the maps, and three times the samples that their field is warped onto (a fit), for each wavelength."""
-    pixels = sum(found.values.numel() for found in query.lens.pixel_maps(query.wavelengths))
-    pairs = zip(query.displacement.tolist(), query.wavelengths.tolist(), strict=True)
-    counts = [samples_by_rule(query, displacement=spread, wavelength=wavelength) for spread, wavelength in pairs]
-    return float(sum(pixels + (0 if query.paraxial else 3 * count**2) for count in counts))
-
-
-def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
-    """Share of each pixel in each layer of a map: linear between neighbours, or all in the nearest.
-
-    Args:      vergence: (B, 1, H, W) [1/m]; beyond the layers all is in the last. layers: (Z,) ascending, Z > 1 [1/m].
-    Returns:   (B, Z, H, W), sums to 1 over the layers.
-    """
-    layers = layers.to(vergence.device)
-    before = torch.searchsorted(layers.detach(), vergence.detach().contiguous(), right=True) - 1
-    before = before.clamp(0, layers.numel() - 2)
-    low, high = layers[before], layers[before + 1]
-    position = (before + (vergence - low) / (high - low)).clamp(0, layers.numel() - 1)
-    position = position if interpolate else position.round()
-    index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
-    return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
-
-
-class Layers:
-    """Depth layers from far to near: each is blurred with its own coverage and laid over what is behind it.
-
-    E_k = K_k * sum_(j <= k) m_j,   l_k = (h_k * m_k I) / E_k,   a_k = (K_k * m_k) / E_k,   out <- l_k + (1 - a_k) out
-
-    with K_k the PSFs of layer k weighted by the channel's filter, relative to their own sum: coverage per *channel*, so
-    that the sum over wavelengths stays inside the transform. Dividing by E_k, the share of what is not hidden by nearer
-    layers, extends each layer behind those, whose blurred edge would otherwise show black. The nearest layer has
-    E = 1: its blurred mask covers what is behind. Where all layers share one PSF this is exactly the plain
-    convolution. Without occlusion the layers are added up as they are.
-    Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
-    """
-
-    def __init__(self, planes: Tensor, shares: Tensor | None, *, occlusion: bool = True) -> None:
-        self.planes, self.shares, self.occlusion = planes, shares, occlusion
-        self.light: Tensor = planes.new_zeros(())
-        self._unhidden = planes.new_zeros(())  # pixels that lie in the layers so far
-
-    def add(self, renderer: Renderer, *, first: int) -> None:
-        """Lay the layers of one bank of PSFs, `first` and the following, over those before."""
-        if self.shares is None:
-            self.light = renderer.blur(self.planes, layer=0)
-            return
-        for layer in range(renderer.psfs.shape[0]):
-            share = self.shares[:, first + layer : first + layer + 1]
-            light = renderer.blur(self.planes * share, layer=layer)
-            if not self.occlusion:
-                self.light = self.light + light
-                continue
-            self._unhidden = self._unhidden + share
-            cover, unhidden = renderer.coverage(torch.cat([share, self._unhidden]), layer=layer).chunk(2)
-            floor = unhidden.clamp(min=_COVERAGE_FLOOR)
-            opacity = (cover / floor).clamp(0, 1)
-            self.light = light / floor + (1 - opacity) * self.light

@@ -5,21 +5,25 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from numbers import Integral
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcam.optics.elements import DOE, Aperture, Element, PixelMap, PlanoConvexLens, Scalar, float64, set_scalar
-from kcam.optics.explain import Explanation, explain
-from kcam.optics.propagation import choose
-from kcam.optics.psf import Query
-from kcam.optics.pupil import disc_weights
-from kcam.optics.quadrants import unfold
-from kcam.optics.sampling import MAX_PUPIL_SAMPLES
-from kcam.units import check_distances, check_pixel_pitch, check_positive, check_trained, wavelength_grid
+from kcam.cache import differentiated
+from kcam.optics.elements.stack import ElementStack
+from kcam.optics.propagation.analysis import encircled_energy, mtf
+from kcam.optics.propagation.explain import Explanation, explain
+from kcam.optics.propagation.grid import samples_by_rule
+from kcam.optics.propagation.question import Query, residual_vergence
+from kcam.optics.propagation.row import Propagator
+from kcam.optics.propagation.sampling import MAX_PUPIL_SAMPLES
+from kcam.optics.propagation.table import choose
+from kcam.optics.source import Defocus, PixelGrid, Points
+from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
+OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 TESTED_F_NUMBERS = (1.8, 100.0)
 """Within these the non-paraxial PSF is held to Rayleigh-Sommerfeld.
 
@@ -28,133 +32,38 @@ to what `explain` states from 4 to 100 mm and f/1.8 to f/64 (tests/optics/test_m
 light where the Debye map does not hold: 0.5 for a plano-convex lens at f/1.4. Slower, pinholes spread it to angles at
 which obliquity counts: 0.07 at f/1000.
 """
-_ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
 
 
-class Lens(nn.Module):
+@dataclass(frozen=True)
+class Recipe:
+    """How a lens computes its PSFs; arguments: as of `Lens.psf`, and kappa of `sampling.pupil_samples`."""
+
+    propagator: str | Propagator = "nonparaxial"
+    method: str | None = None
+    samples: int | None = None
+    kappa: float | None = None
+
+    def row(self, query: Query) -> Propagator:
+        """The row of the table that answers."""
+        return choose(query, propagator=self.propagator, method=self.method)
+
+
+_DEFAULT = Recipe()
+
+
+class Lens(ElementStack):
     """Thin elements whose optical paths add in one pupil plane, in front of a sensor.
 
     Args:
         elements: the parts of the lens; exactly one is an aperture.
         focus_distance: sets the sensor where the lens focuses an object at this distance [m], inf allowed; paraxially,
-            at
-            `focus_wavelength`, once: training the elements later does not move the sensor.
+            at `focus_wavelength`, once: training the elements later does not move the sensor.
         sensor_distance: pupil to sensor [m], instead; may be a Parameter.
         focus_wavelength: [m].
     Raises:
         ValueError for no or two apertures, both or neither distance, a focus inside the focal length, r >= R.
         TypeError for something that is no element.
     """
-
-    elements: Sequence[Element]  # held by an nn.ModuleList
-    sensor_distance: Scalar
-
-    def __init__(
-        self,
-        *elements: Element,
-        focus_distance: float | None = None,
-        sensor_distance: Scalar | None = None,
-        focus_wavelength: float = 550e-9,
-    ) -> None:
-        super().__init__()
-        for element in elements:
-            if not isinstance(element, Element):
-                raise TypeError(f"a lens takes elements such as CircularAperture or DOE, got {type(element).__name__}.")
-        apertures = [element for element in elements if isinstance(element, Aperture)]
-        if len(apertures) != 1:
-            raise ValueError(
-                f"a lens has exactly one aperture, got {len(apertures)}; add CircularAperture(diameter=5 * mm) or "
-                "remove all but one."
-            )
-        self.elements = nn.ModuleList(elements)  # type: ignore[assignment]
-        self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
-        if focus_distance is not None and sensor_distance is None:
-            sensor_distance = self._sensor_distance_for(float(check_distances(focus_distance, name="focus_distance")))
-        elif focus_distance is not None or sensor_distance is None:
-            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
-        check_positive(sensor_distance, name="sensor_distance")
-        set_scalar(self, "sensor_distance", sensor_distance)
-        self._check_curvature()
-
-    def configuration(self) -> dict[str, object]:
-        """Constructor arguments, for saving: the sensor's distance, which was set once, rather than the focus."""
-        return {
-            "elements": list(self.elements),
-            "sensor_distance": self.sensor_distance,
-            "focus_wavelength": self.focus_wavelength,
-        }
-
-    def extra_repr(self) -> str:
-        """The sensor's place, for print()."""
-        return f"sensor_distance={float(float64(self.sensor_distance).detach()):.6g}"
-
-    @property
-    def aperture(self) -> Aperture:
-        """The element that bounds the pupil."""
-        return next(element for element in self.elements if isinstance(element, Aperture))
-
-    def aperture_alone(self, *, pixels: int | None = None) -> Lens:
-        """The same pupil at the same distance from the sensor, with nothing in it, or with a flat DOE of n pixels."""
-        flat = [] if pixels is None else [DOE(torch.zeros(pixels, pixels))]
-        return Lens(self.aperture, *flat, sensor_distance=self.sensor_distance)
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether every element is rotationally symmetric by its type."""
-        return all(element.symmetric for element in self.elements)
-
-    @property
-    def has_rings(self) -> bool:
-        """Whether a rotationally symmetric path may have structure along the radius, by its type."""
-        return any(e.symmetric and (e.knots is None or len(e.knots) > 0) for e in self.elements)
-
-    @property
-    def even(self) -> bool:
-        """Whether no element's path tells x from -x and y from -y, by its type; maps of pixels may."""
-        return all(e.symmetric or getattr(e.terms, "__func__", None) is Element.terms for e in self.elements)
-
-    @property
-    def round(self) -> bool:
-        """Whether the rim of the aperture is a circle."""
-        return bool(self.aperture.discs())
-
-    @property
-    def has_pixels(self) -> bool:
-        """Whether an element is a map of flat pixels, a phase or a transmission."""
-        grid = wavelength_grid([self.focus_wavelength])
-        return any(element.pixel_map(grid) is not None for element in self.elements)
-
-    @property
-    def has_pixel_phase(self) -> bool:
-        """Whether an element has its phase on flat pixels, which has no slope."""
-        grid = wavelength_grid([self.focus_wavelength])
-        return any(pixels.factors is not None for pixels in self.pixel_maps(grid))
-
-    def pixel_maps(self, wavelengths: Tensor) -> list[PixelMap]:
-        """The maps of flat pixels among the elements, for wavelengths (L,) [m], in the order of the light."""
-        return [pixels for pixels in (e.pixel_map(wavelengths) for e in self.elements) if pixels is not None]
-
-    def pixel_phase_displacement(self, query: Query) -> float:
-        """How far flat pixels send all but a few 1e-4 of their light on the sensor [m].
-
-        A step of delta radians between neighbours turns light by delta lambda d / 2 pi p, at most to the pixels'
-        Nyquist angle; and flat pixels on a slope are a blazed grating, of whose light delta^2 / 2 pi^2 M lies beyond
-        order M.
-        """
-        total = 0.0
-        for pixels in self.pixel_maps(query.wavelengths):
-            if pixels.factors is None or pixels.values.shape[-1] < 2:
-                continue
-            half_width = query.semi_aperture.detach() if pixels.half_width is None else pixels.half_width
-            pitch = 2 * float(half_width) / pixels.values.shape[-1]
-            steps = pixels.steps()
-            sizes = torch.cat([step.abs().flatten() for step in steps])
-            slope = float(sizes.kthvalue(math.ceil(0.999 * sizes.numel())).values) / (2 * torch.pi)
-            lost = sum(float(step.square().mean()) for step in steps) / (2 * torch.pi**2)
-            orders = math.ceil(lost / _ORDERS_LEFT_OUT) if lost > _ORDERS_LEFT_OUT else 0
-            cycle = float(query.wavelengths.max()) * float(query.sensor_distance.detach()) / pitch
-            total += (slope + orders) * cycle
-        return total
 
     def psf(
         self,
@@ -268,8 +177,7 @@ class Lens(nn.Module):
             raise ValueError(
                 f"distances must be a number or a vector (Z,) with Z >= 1, got shape {tuple(grid.shape)}. Use [2.0]."
             )
-        self._check_trained()
-        self._check_curvature()
+        self.check()
         self._check_f_number()
         return Query(
             lens=self,
@@ -314,26 +222,7 @@ class Lens(nn.Module):
             integrate=integrate,
             dtype=dtype,
         )
-        height, width = query.shape
-        curves = []
-        for wavelength in query.wavelengths:
-            # sampled finer than the pixels, and times the pixel's sinc: the pixels' own samples would alias
-            fine = 2 * _points_per_pixel(query, wavelength) + 1
-            points = _between_pixels(query, wavelength, fine=fine, shape=(height * fine, width * fine))
-            image = choose(points, propagator=propagator, method=method)(points)[:, 0]
-            otf = torch.fft.fftshift(torch.fft.fft2(image), dim=(-2, -1))
-            magnitude2 = otf.real.square() + otf.imag.square()
-            # a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
-            modulation = torch.sqrt(magnitude2 + torch.finfo(dtype).tiny)
-            total = modulation[..., height * fine // 2, width * fine // 2][..., None, None]
-            for dim, n in zip((-2, -1), query.shape, strict=True):
-                modulation = modulation.narrow(dim, n * fine // 2 - n // 2, n)
-                frequency = (torch.arange(n, device=modulation.device) - n // 2) / n  # cycles per pixel
-                if integrate:
-                    sinc = torch.sinc(frequency * query.active).abs().to(modulation)
-                    modulation = modulation * (sinc[:, None] if dim == -2 else sinc)
-            curves.append(modulation / total)
-        return torch.stack(curves, dim=1)
+        return mtf(query, propagator=propagator, method=method)
 
     def encircled_energy(
         self,
@@ -367,71 +256,89 @@ class Lens(nn.Module):
             integrate=integrate,
             dtype=dtype,
         )
-        largest = min(query.shape) // 2
-        curves = []
-        for wavelength in query.wavelengths:
-            fine = 3 * _points_per_pixel(query, wavelength)
-            side = 2 * (largest * fine + 8) + 3
-            points = _between_pixels(query, wavelength, fine=fine, shape=(side, side))
-            image = choose(points, propagator=propagator, method=method)(points)[:, 0]
-            curves.append(torch.stack([_disc_sum(image, k * fine) for k in range(largest + 1)], dim=-1))
-        return torch.stack(curves, dim=1)
+        return encircled_energy(query, propagator=propagator, method=method)
 
-    def power(self, wavelengths: Tensor) -> Tensor:
-        """Paraxial power at each wavelength, (L,) float64 [1/m], without any `Defocus`."""
-        vergences = (element.vergence(wavelengths) for element in self.elements if element.focuses)
-        return -sum(vergences, torch.zeros_like(wavelengths))
+    # ---- as a source of PSFs ---------------------------------------------------------------------------------------
 
-    def focal_length(self, wavelength: float | Tensor = 550e-9) -> float | Tensor:
-        """Paraxial focal length [m]: a float for a float, (L,) float64 for wavelengths (L,); inf without power."""
-        grid = wavelength_grid(wavelength if isinstance(wavelength, Tensor) else [wavelength])
-        focal = 1 / self.power(grid).detach()
-        return focal if isinstance(wavelength, Tensor) and wavelength.ndim else float(focal[0])
-
-    @property
-    def focus_distance(self) -> float:
-        """Object distance that is imaged onto the sensor paraxially at `focus_wavelength` [m]; inf, or < 0 if
-        virtual.
-        """
-        vergence = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0]) - 1 / float(
-            float64(self.sensor_distance).detach()
+    def question(self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT) -> Query:
+        """What `bank` asks of a propagator."""
+        vergences = points.vergences.to(torch.float64)
+        query = self.query(
+            wavelengths,
+            distances=1 / vergences.detach(),
+            pixel_pitch=pixels.pitch,
+            shape=pixels.shape,
+            samples=recipe.samples,
+            fill_factor=pixels.fill_factor,
+            integrate=pixels.integrate,
+            dtype=pixels.dtype,
+            device=pixels.device,
         )
-        # below 1e-9 1/m nothing tells the distance from infinity: 1e-14 waves in a 5 mm aperture
-        return math.inf if abs(vergence) < 1e-9 else 1 / vergence
+        if differentiated(vergences):  # not through 1 / distance, which has no slope at infinity
+            query = replace(query, vergences=vergences.to(query.device))
+        return query if recipe.kappa is None else replace(query, kappa=recipe.kappa)
 
-    @property
-    def f_number(self) -> float:
-        """Working f-number: sensor distance over the width of the aperture."""
-        return float(float64(self.sensor_distance).detach() / (2 * self.aperture.semi_aperture().detach()))
+    def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT) -> Tensor:
+        """PSFs (N, L, h, w) of source points: see `PSFSource`."""
+        query = self.question(points, wavelengths, pixels, recipe)
+        row = recipe.row(query)
+        psfs = row(query)
+        if query.active < 1:
+            # a scene's pixel is a point here: a sensitive part that it hits or misses would gain or lose its light
+            whole = row(replace(query, active=1.0)).sum((-2, -1), keepdim=True)
+            psfs = psfs / psfs.sum((-2, -1), keepdim=True) * whole
+        return psfs
 
-    def aperture_area(self) -> float:
-        """Open area of the aperture [m^2]."""
-        side = 2 * float(self.aperture.semi_aperture().detach())
-        return side**2 * float(torch.as_tensor(self.aperture.open_share()).detach())
+    def operations(
+        self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT
+    ) -> dict[str, float]:
+        """What a bank takes, by kind of work; twice as many bytes take twice as long.
 
-    def _sensor_distance_for(self, focus_distance: float) -> float:
-        power = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0])
-        if power <= 0:
-            raise ValueError(
-                f"this lens has a power of {power:g} 1/m at {self.focus_wavelength * 1e9:.4g} nm and cannot focus: add "
-                "a ThinLens or a PlanoConvexLens, or give sensor_distance=."
-            )
-        image_vergence = power - 1 / focus_distance
-        if image_vergence <= 0:
-            raise ValueError(
-                f"focus_distance {focus_distance:g} m is inside the focal length {1 / power:g} m: no real image. "
-                f"Focus beyond {1 / power:g} m."
-            )
-        return 1 / image_vergence
+        map: pixels of the maps, and three times the samples that their field is warped onto (a fit).
+        """
+        query = self.question(points, wavelengths, pixels, recipe)
+        row = recipe.row(query)
+        found = {row.kind: row.cost(query) * pixels.dtype.itemsize / 4}
+        if self.has_pixel_phase:
+            maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
+            counts = [samples_by_rule(query, index) for index in range(len(query.wavelengths))]
+            found["map"] = float(sum(maps + (0 if query.paraxial else 3 * count**2) for count in counts))
+        return found
 
-    def _check_trained(self) -> None:
-        """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
-        for name, value in (*self.named_parameters(), *self.named_buffers()):
-            check_trained(value, name=f"{name} of the lens")
-        for element in self.elements:
-            element.check()
-        check_positive(self.sensor_distance, name="sensor_distance")
-        check_positive(self.aperture.semi_aperture(), name="semi-aperture")
+    def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
+        """The window that holds all but 0.1 % of the light.
+
+        Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a
+        rim of length P around an area A spreads beyond a radius. Profiles of rings scatter light beyond their rays:
+        then the blur holds all but a tenth of the share.
+        """
+        query = self.question(points, wavelengths, replace(pixels, shape=(1, 1), dtype=torch.float64))
+        blur = float((query.spread(OUTSIDE_SHARE / 10) + self.pixel_phase_displacement(query.wavelengths)).max())
+        tail = float(wavelengths.max()) * float(query.sensor_distance.detach()) / (2 * math.pi**2 * OUTSIDE_SHARE)
+        side = 2 * math.ceil((blur + tail * self.aperture.rim_per_area()) / pixels.pitch) + 1
+        return side, side
+
+    def defocus_waves(self, wavelengths: Tensor) -> float:
+        """a^2 / (2 lambda) at the shortest wavelength."""
+        return float(self.aperture.semi_aperture().detach()) ** 2 / (2 * float(wavelengths.min()))
+
+    def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
+        """How far light is spread, for a planner."""
+        pixels = PixelGrid(pixel_pitch, (1, 1))
+        with torch.no_grad():
+            query = self.question(Points(torch.zeros(1, dtype=torch.float64)), wavelengths, pixels)
+            low, high = sorted((-residual_vergence(query)).aminmax())
+            middle = ((low + high)[None] / 2).clamp(min=1e-9)  # a lens may be focused behind itself
+            query = self.question(Points(middle.cpu()), wavelengths, pixels)
+            semi, distance = float(query.semi_aperture), float(query.sensor_distance)
+            spread = semi * distance / pixel_pitch
+            rays = float(query.displacement.max()) + self.pixel_phase_displacement(query.wavelengths)
+            airy = 0.61 * float(wavelengths.max()) * distance / semi
+        floor = (
+            max(0.0, rays / pixel_pitch - spread * float(torch.maximum(high - middle, middle - low)))
+            + airy / pixel_pitch
+        )
+        return Defocus((float(low), float(high)), spread, floor)
 
     def _check_f_number(self) -> None:
         (fastest, slowest), width = TESTED_F_NUMBERS, 2 * float(self.aperture.semi_aperture().detach())
@@ -445,50 +352,6 @@ class Lens(nn.Module):
                 stacklevel=3,
             )
 
-    def _check_curvature(self) -> None:
-        reach = float(self.aperture.semi_aperture().detach()) * (1 if self.round else math.sqrt(2))
-        for element in self.elements:
-            if not isinstance(element, PlanoConvexLens):
-                continue
-            radius = float(float64(element.radius_of_curvature).detach())
-            if reach >= radius:
-                raise ValueError(
-                    f"the aperture reaches r = {reach:g} m, but the surface ends at its radius of curvature "
-                    f"R = {radius:g} m (r >= R). Use an aperture below {2 * radius:g} m across or a larger R."
-                )
-
 
 def _is_count(value: object) -> bool:
     return isinstance(value, Integral) and int(value) >= 1
-
-
-def _points_per_pixel(query: Query, wavelength: Tensor) -> int:
-    """Whole points per pixel that sample the irradiance, whether or not the query integrates over its pixels."""
-    return math.ceil(replace(query, integrate=True).evaluation_grid(float(wavelength))[0])
-
-
-def _between_pixels(query: Query, wavelength: Tensor, *, fine: int, shape: tuple[int, int]) -> Query:
-    """The same question of one wavelength at points `fine` times as close, not integrated."""
-    pitch = query.pixel_pitch / fine
-    return replace(query, wavelengths=wavelength[None], pixel_pitch=pitch, shape=shape, integrate=False)
-
-
-def _disc_sum(image: Tensor, radius: int) -> Tensor:
-    """Integral over a disc around the centre of an odd image (..., 2K+1, 2K+1), radius in samples; (...)."""
-    if radius == 0:
-        return image.sum((-2, -1)) * 0
-    half = radius + 8
-    centre = image.shape[-1] // 2
-    weights = unfold(disc_weights(2 * half, spacing=1.0, radius=float(radius))).to(image)
-    # the weights' nodes lie half-way between the image's points: shift by half a sample in the frequency domain
-    window = image[..., centre - half : centre + half, centre - half : centre + half]
-    return (window * _half_shifted(weights)).sum((-2, -1))
-
-
-def _half_shifted(weights: Tensor) -> Tensor:
-    """The weights at integer positions instead of half-integer ones, by their band-limited interpolation."""
-    n = weights.shape[-1]
-    frequency = torch.fft.fftfreq(n, device=weights.device, dtype=torch.float64)
-    turn = torch.complex((torch.pi * frequency).cos(), -(torch.pi * frequency).sin())
-    spectrum = torch.fft.fft2(weights.to(torch.float64)) * turn[:, None] * turn
-    return torch.fft.ifft2(spectrum).real.to(weights)

@@ -16,18 +16,13 @@ import torch
 
 from kcam import files, measure, optics
 from kcam.effects import Work
+from kcam.optics.propagation.row import Propagator
 from kcam.plain import from_json
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um
 
-RATES: dict[str, float] = {
-    "matrix": 4e-11,
-    "chirp_z": 4e-11,
-    "fft": 4e-11,
-    "radial": 1.5e-10,
-    "rays": 1.5e-10,
-    "quadrature": 4e-11,
+RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.values()} | {
     "map": 1.2e-08,
     "bank": 5e-3,
     "psf": 6e-4,
@@ -39,19 +34,25 @@ RATES: dict[str, float] = {
 }
 """Kind of work -> seconds for one operation, on the machine where the defaults were measured (one core, float32).
 
-matrix, chirp_z, fft, radial, rays, quadrature: an operation as `Propagator.cost` counts it. map: a pixel of a DOE at a
+Those of the rows of `optics.PROPAGATORS`: an operation as `Propagator.cost` counts it. map: a pixel of a DOE at a
 wavelength. bank, psf: a call, and each PSF in it. transform: n log2(n) of a real FFT of n points. product: a
 multiplication and addition in a convolution without FFT. touch: one pass over a number. large: a number of a picture of
 more than a megapixel, once if in tiles. layer: of depth, beside its transforms.
 """
 
-LIKE = {"chirp_z": "matrix", "fft": "matrix", "quadrature": "matrix", "rays": "radial"}
-"""Kinds that are counted in the operations of another, so that one rate serves both."""
-
 
 def seconds(work: Work, rates: Mapping[str, float]) -> float:
-    """Predicted time of a work."""
-    return sum(count * rates.get(kind, 0.0) for kind, count in work.operations.items())
+    """Predicted time of a work.
+
+    Raises: ValueError for a kind of work without a rate.
+    """
+    for kind in work.operations:
+        if kind not in rates:
+            raise ValueError(
+                f"no rate for work of the kind {kind!r}; known: {', '.join(rates)}. Give seconds for one of its "
+                f"operations, such as seconds(work, rates | {{{kind!r}: 1e-10}})."
+            )
+    return sum(count * rates[kind] for kind, count in work.operations.items())
 
 
 def rates_path() -> Path:
@@ -65,13 +66,17 @@ class _Kept(TypedDict):
     rates: dict[str, float]
 
 
-def current_rates() -> dict[str, float]:
-    """This machine's rates where it was calibrated, else the defaults; a damaged file counts as none."""
+def current_rates(propagator: str | Propagator = "") -> dict[str, float]:
+    """This machine's rates where it was calibrated, else the defaults; a damaged file counts as none.
+
+    propagator: of an `Imaging`; a row of one's own brings the rate of its own kind of work.
+    """
+    own = {propagator.kind: propagator.rate} if isinstance(propagator, Propagator) else {}
     try:
         kept = from_json(rates_path().read_bytes(), _Kept, wrong=f"{rates_path()} is damaged")["rates"]
     except (OSError, ValueError):
-        return dict(RATES)
-    return RATES | {kind: float(rate) for kind, rate in kept.items() if kind in RATES and 0 < rate < math.inf}
+        return own | RATES
+    return own | RATES | {kind: float(rate) for kind, rate in kept.items() if kind in RATES and 0 < rate < math.inf}
 
 
 def save_rates(rates: Mapping[str, float]) -> Path:
@@ -105,20 +110,15 @@ def calibrate(*, rounds: int = 3, advance: Callable[[str], None] | None = None) 
         channels = None if colours is None else colours.contraction(scene.wavelengths).shape[0]
         works.append(imaging.work(scene, channels=channels))
         times.append(statistics.median(found[1:]))
-    kinds = [kind for kind in RATES if kind not in LIKE and any(kind in work.operations for work in works)]
-    counts = np.array([[_count(work, kind) for kind in kinds] for work in works]) / np.array(times)[:, None]
+    kinds = [kind for kind in RATES if any(kind in work.operations for work in works)]
+    counts = np.array([[work.operations.get(kind, 0.0) for kind in kinds] for work in works]) / np.array(times)[:, None]
     scale = counts.max(axis=0)
     solution = nnls(counts / scale, np.ones(len(times)))[0] / scale
     # what took no time beside the others keeps a small rate: a price of nothing would be chosen without end
     fitted = {kind: float(max(rate, 0.02 * RATES[kind])) for kind, rate in zip(kinds, solution, strict=True)}
     rates = RATES | fitted
-    rates |= {kind: rates[other] for kind, other in LIKE.items()}
     off = [max(p / t, t / p) for p, t in zip((seconds(work, rates) for work in works), times, strict=True)]
     return rates, statistics.median(off)
-
-
-def _count(work: Work, kind: str) -> float:
-    return sum(count for other, count in work.operations.items() if LIKE.get(other, other) == kind)
 
 
 def _pictures() -> Iterator[tuple[str, optics.Imaging, Scene, ColourFilter | None]]:

@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from kcam.optics import Imaging
-from kcam.optics.propagation import choose
-from kcam.optics.sampling import KAPPA
+from kcam.optics import Imaging, Lens
+from kcam.optics.propagation.sampling import KAPPA
+from kcam.optics.source import Points
 from kcam.planner.trials import Trials
 from kcam.scene import Scene
 
@@ -124,17 +124,20 @@ class _View:
 
     def __init__(self, trials: Trials, imaging: Imaging, scene: Scene) -> None:
         self.imaging, self.scene = imaging, scene
-        planes = imaging._working(scene)
-        self.vergences, _ = imaging._layers_of(scene, planes)
+        planes = imaging.working(scene)
+        self.vergences, _ = imaging.layers_of(scene, planes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
-        self.layers = len(imaging._vergences(scene, depth)) if depth.numel() else 1
+        self.layers = len(imaging.vergences(scene, depth)) if depth.numel() else 1
         self.bands = min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
         ends = torch.stack([self.vergences.min(), self.vergences.max()])
-        query = imaging._query(scene.wavelengths, ends, self.window, planes)
-        self.blur = float(query.displacement.max()) + imaging.lens.pixel_phase_displacement(query)
-        self.row = choose(query, propagator=imaging.propagator, method=imaging.method)
-        self.trained = any(p.requires_grad for p in imaging.lens.parameters())
+        self.blur, self.row = 0.0, None
+        if isinstance(lens := imaging.lens, Lens):
+            pixels = imaging.pixels(self.window, planes)
+            query = lens.question(Points(ends), scene.wavelengths, pixels, **imaging.recipe)
+            self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
+            self.row = imaging.recipe["recipe"].row(query)
+        self.trained = any(p.requires_grad for p in imaging.parameters())
         self.beside = self.few()
 
     def few(self, *, bands: bool = True, layers: bool = True, window: bool = True) -> dict[str, Any]:
@@ -151,7 +154,7 @@ class _View:
 
 
 def _blur(view: _View) -> Iterator[Ladder]:
-    label = f"{view.row.physics}, {view.row.method}"
+    label = f"{view.row.physics}, {view.row.method}" if view.row else "as measured"
     levels = [Level("none", {"blur": False}), Level(label, {})]
     if view.trained:
         levels = levels[1:]  # a parameter of the lens that trains acts through it
@@ -161,7 +164,7 @@ def _blur(view: _View) -> Iterator[Ladder]:
 def _model(view: _View) -> Iterator[Ladder]:
     """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
     imaging = view.imaging
-    if imaging.propagator != "nonparaxial" or not imaging.lens.has_pixels:
+    if imaging.propagator != "nonparaxial" or not isinstance(imaging.lens, Lens) or not imaging.lens.has_pixels:
         return
     levels = [Level("fresnel", {"propagator": "fresnel"}), Level("nonparaxial", {})]
     yield Ladder("model", levels, view.beside)
@@ -172,7 +175,10 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     more, so that a few would not tell.
     """
     imaging = view.imaging
-    if not view.row.on_grid or imaging.samples is not None or imaging.lens.has_pixel_phase:
+    lens = imaging.lens
+    if view.row is None or not isinstance(lens, Lens) or lens.has_pixel_phase:
+        return
+    if not view.row.on_grid or imaging.samples is not None:
         return
     own = imaging.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]

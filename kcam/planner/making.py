@@ -274,7 +274,8 @@ class _Prices:
     """Predicted time and memory of the raw of the scene that takes longest."""
 
     def __init__(self, camera: Camera, trials: Trials, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
-        self.imaging, self.always, self.rates = trials.imaging, always, costs.current_rates()
+        self.imaging, self.always = trials.imaging, always
+        self.rates = costs.current_rates("" if self.imaging is None else self.imaging.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
         self.scene = scenes[0]

@@ -19,8 +19,9 @@ from kcam import files
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context
 from kcam.optics import Imaging
+from kcam.optics.source import Defocus
 from kcam.plain import from_json
-from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Defocus, Survey, survey
+from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
 
@@ -137,7 +138,7 @@ class Range:
 
     def leaves(self, scene: Scene) -> str | None:
         """In what a scene's geometry lies outside, or None; a tenth of the depth is let pass."""
-        other = Range.of([scene], [], Defocus.none())
+        other = Range.of([scene], [], Defocus())
         slack = 0.1 * (self.nearest - self.farthest) + 1e-9
         if other.wavelengths != self.wavelengths:
             return f"has other wavelengths ({len(other.wavelengths)}) than were planned for ({len(self.wavelengths)})"

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from kcam.camera import Camera
 from kcam.isp import Clip
-from kcam.optics import Imaging
-from kcam.optics.psf import residual_vergence
+from kcam.optics.source import Defocus
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, DarkCurrent, Exposure, ShotNoise
 from kcam.sensor.noise import Mean
@@ -45,49 +44,6 @@ KINDS = (
 
 OF_DEPTH, NEIGHBOURS = KINDS[2:5], 5
 """The kinds that nothing but depth makes hurt; which is the contrast between neighbours."""
-
-
-@dataclass(frozen=True)
-class Defocus:
-    """How far a lens sends light that is out of focus, in pixels: floor + spread |V - focus|.
-
-    focus: the vergences in focus of the shortest and the longest wavelengths [1/m]. spread [m]. floor: of what is in
-    focus, with aberrations, DOEs and diffraction.
-    """
-
-    focus: tuple[float, float]
-    spread: float
-    floor: float
-
-    @classmethod
-    def none(cls) -> Defocus:
-        """Of a camera without optics."""
-        return cls((0.0, 0.0), 0.0, 0.0)
-
-    @classmethod
-    def of(cls, imaging: Imaging, wavelengths: Tensor) -> Defocus:
-        """Of a lens as it is now."""
-        if not imaging.blur:
-            return cls.none()
-        with torch.no_grad():
-            query = imaging._query(wavelengths, torch.zeros(1, dtype=torch.float64), (1, 1), torch.empty(0))
-            low, high = sorted((-residual_vergence(query)).aminmax())
-            middle = ((low + high)[None] / 2).clamp(min=1e-9)  # a lens may be focused behind itself
-            query = imaging._query(wavelengths, middle.cpu(), (1, 1), torch.empty(0))
-            semi, distance = float(query.semi_aperture), float(query.sensor_distance)
-            spread = semi * distance / imaging.pixel_pitch
-            rays = float(query.displacement.max()) + imaging.lens.pixel_phase_displacement(query)
-            airy = 0.61 * float(wavelengths.max()) * distance / semi
-        floor = (
-            max(0.0, rays / imaging.pixel_pitch - spread * float(torch.maximum(high - middle, middle - low)))
-            + airy / imaging.pixel_pitch
-        )
-        return cls((float(low), float(high)), spread, floor)
-
-    def radius(self, vergence: Tensor) -> Tensor:
-        """Radius of the blur of what lies at a vergence [pixels]."""
-        low, high = self.focus
-        return self.floor + self.spread * torch.maximum((vergence - low).abs(), (vergence - high).abs())
 
 
 @dataclass(frozen=True)

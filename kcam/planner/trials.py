@@ -27,6 +27,7 @@ from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import Imaging
+from kcam.optics.source import Defocus
 from kcam.planner.plan import (
     COLOUR,
     DEPTH,
@@ -38,7 +39,7 @@ from kcam.planner.plan import (
     shortened,
     with_imaging,
 )
-from kcam.planner.survey import KINDS, TILE, Defocus, Survey, survey
+from kcam.planner.survey import KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
 from kcam.sensor.noise import RandomStage
@@ -84,7 +85,7 @@ class Trials:
         self.imaging: Imaging | None = None if self.index is None else stages[self.index]
         self.parameters = [p for p in self.raw_camera.parameters() if p.requires_grad]
         self.gradients = torch.is_grad_enabled() and bool(self.parameters)
-        self.defocus = Defocus.none() if self.imaging is None else Defocus.of(self.imaging, scenes[0].wavelengths)
+        self.defocus = Defocus() if self.imaging is None else self.imaging.defocus(scenes[0].wavelengths)
         full = [scene for scene in scenes if scene.coefficients.numel()]
         self.surveys = [survey(scene, self.raw_camera, self.defocus) for scene in full]
         self.samples = _samples(full, self.surveys, pixels=LARGEST, side=CROP)

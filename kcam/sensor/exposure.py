@@ -141,13 +141,19 @@ class Exposure(Stage):
                 "optics.Imaging(lens, ...) before it, pass Context(lens=lens), or leave time=None for automatic "
                 "exposure."
             )
+        area, distance = context.lens.aperture_area(), context.lens.sensor_distance
+        if area is None or distance is None:
+            raise ValueError(
+                f"Exposure(time=...) needs aperture_area= and sensor_distance= of the {type(context.lens).__name__}. "
+                "Give them, or leave time=None for automatic exposure."
+            )
         grid = torch.arange(400, 741, dtype=torch.float64) * nm
         electrons = electrons_per_unit(
             response=_green(colour_filter.response(grid)),
             wavelengths=grid,
             luminance=context.luminance,
-            aperture_area=context.lens.aperture_area(),
-            sensor_distance=context.lens.sensor_distance,
+            aperture_area=area,
+            sensor_distance=distance,
             pixel_area=context.pixel_pitch**2 * context.fill_factor,
             time=self.time,
             quantum_efficiency=self.quantum_efficiency,

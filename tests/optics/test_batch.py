@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from kcam import optics
-from kcam.optics import batch
+from kcam.optics.propagation import batch
 from kcam.units import mm, um
 
 WAVELENGTHS = torch.tensor([450e-9, 650e-9], dtype=torch.float64)

@@ -10,7 +10,7 @@ import torch
 from scipy import special
 
 from kcam import optics
-from kcam.optics.cells import cell_edges, disc_cells
+from kcam.optics.propagation.cells import cell_edges, disc_cells
 from kcam.units import mm, nm, um
 
 LIKE = {"dtype": torch.float64, "device": torch.device("cpu")}

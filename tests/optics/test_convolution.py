@@ -10,7 +10,9 @@ from torch import Tensor
 
 from kcam import optics
 from kcam.context import Context
-from kcam.optics.convolution import BORDERS, Renderer
+from kcam.optics.rendering.borders import BORDERS
+from kcam.optics.rendering.renderer import Renderer
+from kcam.optics.rendering.ways import WAYS as TABLE
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um, wavelength_grid
@@ -76,6 +78,22 @@ def test_bands_that_share_a_psf(content: str, way: dict) -> None:
     torch.testing.assert_close(shared.blur(planes, layer=0), copied.blur(planes, layer=0))
     mask = random(2, 1, *picture, seed=6)
     torch.testing.assert_close(shared.coverage(mask, layer=0), copied.coverage(mask, layer=0))
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("name", TABLE)
+def test_every_row_of_the_table_gives_what_the_chosen_one_gives(name: str, content: str) -> None:
+    """Also where another is cheaper; each band by itself knows no filter, which then weights its result."""
+    factors, channels = CONTENTS[content]
+    picture, bands = (21, 18), 5
+    spectra = None if factors is None else random(factors, bands, seed=3)
+    weights = None if channels is None else random(channels, bands, seed=4)
+    planes, psfs = random(2, factors or bands, *picture, seed=1), random(1, bands, 6, 9, seed=2)
+    renderer = Renderer(psfs, spectra=spectra, weights=weights, picture=picture)
+    light = TABLE[name].blur(renderer, psfs[0])(planes)
+    if name == "each" and weights is not None:
+        light = torch.einsum("cl,blyx->bcyx", weights, light)
+    torch.testing.assert_close(light, renderer.blur(planes, layer=0))
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -152,7 +170,7 @@ def test_bad_shortcuts_say_what_is_wrong(arguments: dict, text: str) -> None:
 
 @pytest.mark.parametrize("span", [range(1, 1200), range(99_000, 99_100)], ids=["short", "long"])
 def test_fast_lengths_are_the_shortest(span: range) -> None:
-    from kcam.optics.transforms import fast_length
+    from kcam.optics.numerics import fast_length
 
     def smooth(n: int) -> bool:
         for factor in (2, 3, 5, 7):

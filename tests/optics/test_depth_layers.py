@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcam import Camera, optics
 from kcam.context import Context
-from kcam.optics.imaging import layer_shares
+from kcam.optics.rendering.depth import layer_shares
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um, wavelength_grid
@@ -78,7 +78,7 @@ def between_layers(seed: int, kind: str) -> tuple[float, float]:
     for colours in (ColourFilter.kodak(), None):
         found, truth = (stage(s, colour_filter=colours)[..., :28, :] for s in (mapped, scene.with_depth(1 / middle)))
         errors.append(largest(found, truth))
-    layers = stage._layers_of(mapped, mapped.coefficients)[0]
+    layers = stage.layers_of(mapped, mapped.coefficients)[0]
     assert float(layers.diff().max()) / wave == pytest.approx(step, rel=0.01)
     assert float((layers - middle).abs().min()) / wave == pytest.approx(step / 2, rel=0.01)
     return errors[0], errors[1]

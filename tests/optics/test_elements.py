@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from kcam import optics
-from kcam.optics.elements import Element, noll_indices, zernike_sum
-from kcam.optics.pupil import Pupil
+from kcam.optics.elements.element import Element
+from kcam.optics.elements.zernike import noll_indices, zernike_sum
+from kcam.optics.pupil.coordinates import Pupil
 from kcam.units import mm, nm
 
 WAVELENGTHS = torch.tensor([450, 550, 650], dtype=torch.float64) * nm

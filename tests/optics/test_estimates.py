@@ -12,9 +12,10 @@ import torch
 
 from kcam import optics
 from kcam.optics import PROPAGATORS
-from kcam.optics.angular_spectrum import spectrum_grids
-from kcam.optics.psf import Query, samples_by_rule
-from kcam.optics.reference import _evaluate, _refined, convergence
+from kcam.optics.propagation.grid import samples_by_rule
+from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.reference import _evaluate, _refined, convergence
+from kcam.optics.propagation.spectrum import spectrum_grids
 from kcam.units import mm, nm, um
 
 FLOOR = 1e-6  # of float32: below it an estimate may be as much too small as it likes
@@ -70,7 +71,7 @@ def random_query(seed: int) -> Query:
             integrate=rng.random() < 0.7,
         )  # fmt: skip
         # the reference is to take a second, not a minute
-        if samples_by_rule(asked, displacement=float(asked.displacement[0]), wavelength=wavelength) <= 400:
+        if samples_by_rule(asked, 0) <= 400:
             return asked
 
 
@@ -196,7 +197,7 @@ def test_the_reference_is_converged_and_meets_a_closed_form(lens: optics.Lens, b
 
 def test_a_reference_that_is_not_converged_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing a user can ask for seems to get there, so its sampling is made coarse."""
-    monkeypatch.setattr("kcam.optics.reference._KAPPA", 0.0)
+    monkeypatch.setattr("kcam.optics.propagation.reference._KAPPA", 0.0)
     lens = singlet(optics.DOE(torch.rand(65, 65, generator=torch.Generator().manual_seed(0)) * 6))
     asked = replace(
         lens.query([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(65, 65)), kappa=1.2, cells_per_sample=1.0

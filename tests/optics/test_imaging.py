@@ -17,8 +17,9 @@ from torch.nn import functional as F
 
 from kcam import Camera, optics, sensor
 from kcam.context import Context
-from kcam.optics.propagation import Propagator, choose
-from kcam.optics.psf import Query
+from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.row import Propagator
+from kcam.optics.propagation.table import choose
 from kcam.scene import Scene
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -745,7 +746,8 @@ def test_a_propagator_of_ones_own() -> None:
     stage = imaging(propagator=row, psf_shape=(3, 3), border="zero")
     scene = cube(depth=1.5, bands=2)
     assert relative(stage(scene), F.avg_pool2d(scene.bands(), 3, 1, 1)) < 1e-13
-    assert choose(stage._query(scene.wavelengths, torch.ones(1), (3, 3), scene.coefficients), propagator=row) is row
+    query = stage.lens.query(scene.wavelengths, distances=1.0, pixel_pitch=stage.pixel_pitch, shape=(3, 3))
+    assert choose(query, propagator=row) is row
 
 
 def test_a_changed_stage_differs_in_what_was_named() -> None:
@@ -769,7 +771,7 @@ def test_what_trades_accuracy_for_time_is_saved(tmp_path: Path) -> None:
 # ---- bad input ---------------------------------------------------------------------------------------------------
 
 BAD = [
-    (lambda: optics.Imaging(optics.ThinLens(0.05)), TypeError, r"Imaging takes an optics.Lens, got ThinLens"),
+    (lambda: optics.Imaging(optics.ThinLens(0.05)), TypeError, r"source of PSFs, got ThinLens"),
     (lambda: imaging(pixel_pitch=4), ValueError, r"pixel_pitch 4 is outside .* did you mean 4 \* um"),
     (lambda: imaging(propagator="ray"), ValueError, r"unknown propagator 'ray'; known: nonparaxial, fresnel"),
     (lambda: imaging(method="hankel")(SCENE), ValueError, r"nonparaxial has no method 'hankel'; known: matrix"),
@@ -825,9 +827,10 @@ def test_the_contraction_has_the_gradient_of_its_formula(
     monkeypatch, border: str, factors: int | None, bands: int, held: int, strips: int
 ) -> None:
     """To the planes, the PSFs, the scene's spectra and the filter: the hand-written adjoint against differences."""
-    from kcam.optics import convolution
-    from kcam.optics.convolution import Contraction, Convolution
-    from kcam.optics.transforms import fast_length
+    from kcam.optics.numerics import fast_length
+    from kcam.optics.rendering import convolution
+    from kcam.optics.rendering.contraction import Contraction
+    from kcam.optics.rendering.convolution import Convolution
 
     monkeypatch.setattr(convolution, "_STRIP", strips)
     monkeypatch.setattr(convolution, "_LINE", 3)
@@ -849,7 +852,8 @@ def test_the_contraction_has_the_gradient_of_its_formula(
 
 @pytest.mark.parametrize("max_memory", [1e9, 1.0], ids=["held", "again"])
 def test_spectra_are_computed_again_where_they_do_not_fit(monkeypatch, max_memory: float) -> None:
-    from kcam.optics.convolution import Contraction, Convolution
+    from kcam.optics.rendering.contraction import Contraction
+    from kcam.optics.rendering.convolution import Convolution
 
     calls = []
     whole = Convolution.rows
@@ -863,7 +867,7 @@ def test_spectra_are_computed_again_where_they_do_not_fit(monkeypatch, max_memor
 @pytest.mark.parametrize(("tile", "layers", "held"), [(None, 1, True), (None, 8, False), (64, 1, False)])
 def test_what_is_held_stays_within_a_quarter_of_the_memory(tile: int | None, layers: int, held: bool) -> None:
     """Of all layers together; tiles hold nothing."""
-    from kcam.optics.convolution import Renderer
+    from kcam.optics.rendering.renderer import Renderer
 
     bands, saved = 28, []
 
@@ -890,7 +894,7 @@ def test_what_is_held_stays_within_a_quarter_of_the_memory(tile: int | None, lay
 @pytest.mark.parametrize("side", [40, 300], ids=["few planes", "many"])
 def test_a_rendered_picture_can_be_changed_in_place(side: int) -> None:
     """A view from inside the hand-written adjoint could not."""
-    from kcam.optics.convolution import Renderer
+    from kcam.optics.rendering.renderer import Renderer
 
     psfs = torch.rand(1, 6, 21, 21, requires_grad=True)
     renderer = Renderer(psfs, spectra=None, weights=torch.rand(3, 6), picture=(side, side))
@@ -906,7 +910,7 @@ def test_a_rendered_picture_can_be_changed_in_place(side: int) -> None:
 @pytest.mark.parametrize("planes", [None, 8], ids=["bands", "planes"])
 def test_a_rendering_compiles(planes: int | None) -> None:
     """The contraction stands aside: fake tensors cannot follow its views of complex numbers."""
-    from kcam.optics.convolution import Renderer
+    from kcam.optics.rendering.renderer import Renderer
 
     psfs = torch.rand(1, 6, 21, 21, requires_grad=True)
     spectra = None if planes is None else torch.rand(planes, 6)
@@ -921,7 +925,7 @@ def test_a_rendering_compiles(planes: int | None) -> None:
 
 
 def test_the_rows_of_a_part_of_the_bands_fit_into_a_quarter_of_the_memory() -> None:
-    from kcam.optics.convolution import Convolution
+    from kcam.optics.rendering.convolution import Convolution
 
     batch, bands, memory = 2, 28, 1e8
     plan = Convolution.of((300, 200), (41, 31), border="reflect", itemsize=4, max_memory=memory)
@@ -934,7 +938,8 @@ def test_the_rows_of_a_part_of_the_bands_fit_into_a_quarter_of_the_memory() -> N
 
 def test_a_window_wider_than_a_picture_in_the_dark_trains() -> None:
     """Zeros around a picture of 16 pixels, and a PSF of 41: it has a gradient in all of its pixels."""
-    from kcam.optics.convolution import Contraction, Convolution
+    from kcam.optics.rendering.contraction import Contraction
+    from kcam.optics.rendering.convolution import Convolution
 
     plan = Convolution.of((7, 6), (19, 18), border="zero", itemsize=8, max_memory=1e9)
     psfs, planes, weights = random(2, 19, 18).requires_grad_(), random(1, 2, 7, 6), random(1, 2)
@@ -945,8 +950,9 @@ def test_a_window_wider_than_a_picture_in_the_dark_trains() -> None:
 @pytest.mark.parametrize("border", ["reflect", "replicate", "periodic", "zero"])
 def test_transforms_are_those_of_the_extended_picture(monkeypatch, border: str, pixels_in_cache: int) -> None:
     """The rows of the border are not transformed again, nor planes all at once: it is one FFT of the whole still."""
-    from kcam.optics import convolution
-    from kcam.optics.convolution import Convolution, extend
+    from kcam.optics.rendering import convolution
+    from kcam.optics.rendering.borders import extend
+    from kcam.optics.rendering.convolution import Convolution
 
     monkeypatch.setattr(convolution, "_PIXELS_IN_CACHE", pixels_in_cache)
     plan = Convolution.of((12, 10), (5, 8), border=border, itemsize=8, max_memory=1e9)
@@ -964,7 +970,8 @@ def test_transforms_are_those_of_the_extended_picture(monkeypatch, border: str, 
 
 
 def test_a_batch_shares_the_transforms_of_its_psfs(monkeypatch: pytest.MonkeyPatch) -> None:
-    from kcam.optics.convolution import Contraction, Convolution
+    from kcam.optics.rendering.contraction import Contraction
+    from kcam.optics.rendering.convolution import Convolution
 
     transformed = []
     whole = Convolution.conjugate_rows

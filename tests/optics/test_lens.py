@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from kcam import optics
-from kcam.optics.propagation import choose
+from kcam.optics.propagation.table import choose
 from kcam.units import mm, nm, um
 
 WAVELENGTH = 550 * nm

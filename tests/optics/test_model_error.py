@@ -12,7 +12,7 @@ import torch
 
 from kcam import optics
 from kcam.optics import PROPAGATORS
-from kcam.optics.psf import Query
+from kcam.optics.propagation.question import Query
 from kcam.units import mm, nm, um
 from tests import oracles
 
@@ -159,7 +159,7 @@ def test_what_integration_over_pixels_adds_is_stated(monkeypatch: pytest.MonkeyP
         lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(focal), focus_distance=math.inf)
         asked = lens.query([550 * nm], distances=distance, pixel_pitch=pitch, shape=(n, n), dtype=torch.float64)
         with monkeypatch.context() as wider:
-            wider.setattr("kcam.optics.sampling.WINDOW_MARGIN", 96)
+            wider.setattr("kcam.optics.propagation.sampling.WINDOW_MARGIN", 96)
             truth = DEFAULT(asked)
         error = float((DEFAULT(asked) - truth).abs().sum() / truth.sum())
         print(f"{error:.1e}, stated {DEFAULT.model_error(asked):.1e}")

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from kcam import optics
-from kcam.optics.propagation import choose
+from kcam.optics.propagation.table import choose
 from kcam.units import mm, nm, um
 
 WAVELENGTH = 550 * nm

@@ -13,8 +13,10 @@ from torch import nn
 
 from kcam import optics
 from kcam.optics import PROPAGATORS
-from kcam.optics.propagation import PHYSICS, Propagator, choose
-from kcam.optics.psf import Query
+from kcam.optics.propagation.estimates import trace
+from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.row import Propagator
+from kcam.optics.propagation.table import PHYSICS, choose
 from kcam.units import mm, nm, um
 
 ROWS = [pytest.param(row, id="-".join(key)) for key, row in PROPAGATORS.items()]
@@ -270,6 +272,17 @@ def test_cost_and_error_are_known_before_anything_is_computed(row: Propagator) -
     assert 0 < row.cost(small) < row.cost(large)
     assert row.cost(small) < row.cost(several)
     assert 0 < row.error(small) <= 2
+    assert row.rate > 0
+    assert row.about
+
+
+def test_both_models_share_what_does_not_depend_on_them() -> None:
+    asked = query(small_lens(), 33)
+    paraxial = asked.modelled(paraxial=True)
+    assert (asked.modelled(paraxial=False), paraxial.modelled(paraxial=True)) == (asked, paraxial)
+    assert asked.modelled(paraxial=True) is paraxial
+    assert trace(paraxial) is trace(asked)
+    assert paraxial.scale != asked.scale
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -375,7 +388,7 @@ def test_fft_refuses_points_that_its_bins_cannot_reach() -> None:
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1.2e-7), (torch.float64, 2.5e-16)])
 def test_sines(monkeypatch: pytest.MonkeyPatch, threads: int, dtype: torch.dtype, error: float) -> None:
     """To the last bit or so over the phases of a pupil, by numpy on few threads and by torch on many; inf is NaN."""
-    from kcam.optics.transforms import sines
+    from kcam.optics.numerics import sines
 
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     angle = torch.linspace(-3000, 3000, 30001, dtype=torch.float64).to(dtype)

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from kcam import measure
-from kcam.optics import pupil
-from kcam.optics.pupil import disc_weights, grid_nodes, grid_spacing
-from kcam.optics.warp import Warp
+from kcam.optics.pupil import rim
+from kcam.optics.pupil.coordinates import grid_nodes, grid_spacing
+from kcam.optics.pupil.rim import disc_weights
+from kcam.optics.pupil.warp import Warp
 
 
 @pytest.mark.parametrize(("count", "radius"), [(64, 1.0), (66, 0.37), (200, 0.9)])
@@ -24,7 +25,7 @@ def test_edge_weights_sum_to_the_area_of_the_disc(count: int, radius: float) -> 
 @pytest.mark.parametrize("at_once", [1, 7, 10**6])
 def test_edge_weights_do_not_depend_on_their_blocks(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = disc_weights(130, spacing=grid_spacing(130))
-    monkeypatch.setattr(pupil, "_NODES_AT_ONCE", at_once)
+    monkeypatch.setattr(rim, "_NODES_AT_ONCE", at_once)
     blocks = disc_weights.__wrapped__(130, spacing=grid_spacing(130))
     # sums of 63 x 63 terms of at most 1, in another order
     torch.testing.assert_close(blocks, expected, rtol=0, atol=1e-14)

@@ -9,11 +9,12 @@ import torch
 from torch import nn
 
 from kcam import optics
-from kcam.optics import PROPAGATORS, pixels, sampling
-from kcam.optics.cells import Cells
-from kcam.optics.pixels import Pixels, _Parities
-from kcam.optics.quadrants import by_x, join, join_adjoint, parities, split, unfold
-from kcam.optics.transforms import MatrixTransform
+from kcam.optics import PROPAGATORS
+from kcam.optics.propagation import pixels, sampling
+from kcam.optics.propagation.cells import Cells
+from kcam.optics.propagation.pixels import Pixels, _Parities
+from kcam.optics.propagation.transforms import MatrixTransform
+from kcam.optics.pupil.quadrants import by_x, join, join_adjoint, parities, split, unfold
 from kcam.units import mm, nm, um
 
 DOUBLE = torch.float64

@@ -11,9 +11,9 @@ from scipy.fft import next_fast_len
 
 from benchmarks.baselines import angular_spectrum_psf, doe_scale, textbook_psf_bank
 from kcam import optics
-from kcam.optics.materials import refractive_index
-from kcam.optics.propagation import choose
-from kcam.optics.textbook import (
+from kcam.optics.elements.materials import refractive_index
+from kcam.optics.propagation.table import choose
+from kcam.optics.propagation.textbook import (
     textbook_angular_spectrum,
     textbook_angular_spectrum_row,
     textbook_psf,

@@ -10,8 +10,8 @@ from draws import Draw
 from torch import Tensor
 
 from kcam import optics
-from kcam.optics.convolution import BORDERS
 from kcam.optics.imaging import _not_negative, wide_range
+from kcam.optics.rendering.borders import BORDERS
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um, wavelength_grid

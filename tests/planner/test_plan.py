@@ -18,8 +18,11 @@ from torch import Tensor, nn
 import kcam
 from benchmarks.planner import LATER, TOLERANCES, hard_pair, later_scene, random_pair
 from kcam import Camera, Scene, isp, optics, sensor
-from kcam.planner import OutOfRange, Plan, Planner, noiseless_raw, relative_rms, trials
+from kcam.effects import Work
+from kcam.optics.propagation.row import Propagator
+from kcam.planner import OutOfRange, Plan, Planner, costs, noiseless_raw, relative_rms, trials
 from kcam.planner.ladders import even_counts
+from kcam.planner.plan import with_imaging
 from kcam.units import mm, um, wavelength_grid
 
 
@@ -310,6 +313,36 @@ def test_nothing_through_which_a_parameter_trains_is_left_out() -> None:
     assert "ReadNoise" not in {row.effect for row in plan.decisions}
     assert 5 not in plan.skipped
     assert plan.gradients
+
+
+def own_row(cost: float = 1e6, **arguments) -> Propagator:
+    matrix = optics.PROPAGATORS["fresnel", "matrix"]
+    functions = {"function": matrix.function, "error": matrix.error_of, "cost": lambda query: cost}
+    return Propagator("my own", "of an unknown name", valid=lambda query: None, **functions, **arguments)
+
+
+@pytest.mark.parametrize(("arguments", "rate"), [({}, costs.RATES["matrix"]), ({"rate": 2e-9}, 2e-9)])
+def test_a_propagator_of_ones_own_has_its_price(arguments: dict[str, float], rate: float) -> None:
+    """Without a rate its operations count as those of a matrix product."""
+    shot, row = camera(psf_shape=(9, 9)), own_row(1e6, **arguments)
+    works = [shot[0].changed(propagator=own).work(scene(), channels=3) for own in (row, own_row(3e6, **arguments))]
+    cheap, dear = (costs.seconds(work, costs.current_rates(row)) for work in works)
+    assert cheap > 0
+    assert dear - cheap == pytest.approx(2e6 * rate, rel=1e-6)
+    with torch.no_grad():
+        plan = Planner(with_imaging(shot, propagator=row), scene()).plan(0.0)
+    assert plan.seconds > 1e6 * rate
+
+
+def test_nothing_is_free() -> None:
+    with pytest.raises(ValueError, match=r"no rate for work of the kind 'juggling'; known: matrix, .* Give seconds"):
+        costs.seconds(Work({"touch": 1.0, "juggling": 3.0}), costs.RATES)
+    with pytest.raises(ValueError, match=r"my own/of an unknown name states a cost of 0 operations.*Give cost="):
+        camera(propagator=own_row(0.0))[0].work(scene())
+    with pytest.raises(
+        ValueError, match=r"rate must be > 0 seconds for an operation of my own/.*, got 0"
+    ):
+        own_row(rate=0.0)
 
 
 def test_a_step_in_depth_needs_two_layers_and_occlusion_a_plane_neither() -> None:

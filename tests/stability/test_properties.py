@@ -14,7 +14,7 @@ from strategies import DOUBLE, between, distances, examples, imagings, lenses, s
 from torch import Tensor
 
 from kcam import Camera, Scene, optics, sensor
-from kcam.optics.propagation import choose
+from kcam.optics.propagation.table import choose
 from kcam.units import mm, nm, um
 
 ROUNDING = 1e-12

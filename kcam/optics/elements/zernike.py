@@ -1,0 +1,77 @@
+"""Zernike polynomials over the pupil, and aberrations made of them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcam.optics.elements.element import Element, Term, check_vector, set_tensor
+from kcam.optics.numerics import float64
+from kcam.optics.pupil.coordinates import Pupil
+
+
+class ZernikeAberration(Element):
+    """Aberrations of the lens as Zernike coefficients of OPD, the same at all wavelengths.
+
+    Args:   coefficients: (K,) of Noll's j = 1..K [m RMS]; a Parameter trains.
+    Raises: ValueError for coefficients that are no vector or not finite.
+    Source: Noll, J. Opt. Soc. Am. 66, 207 (1976).
+    """
+
+    coefficients: Tensor
+
+    def __init__(self, coefficients: Tensor) -> None:
+        super().__init__()
+        check_vector(coefficients, name="coefficients")
+        set_tensor(self, "coefficients", coefficients)
+
+    def terms(self, pupil: Pupil, wavelengths: Tensor) -> list[Term]:
+        return [(torch.ones_like(wavelengths), zernike_sum(self.coefficients, pupil))]
+
+
+def noll_indices(j: int) -> tuple[int, int]:
+    """(n, m) of Noll's single index j >= 1; m < 0 for the sine terms."""
+    n = 0
+    while (n + 1) * (n + 2) // 2 < j:
+        n += 1
+    rest = j - n * (n + 1) // 2 - 1
+    m = (-1) ** j * ((n % 2) + 2 * ((rest + (n + 1) % 2) // 2))
+    return n, m
+
+
+def zernike_sum(coefficients: Tensor, pupil: Pupil) -> Tensor:
+    """sum_j c_j Z_j over the pupil, Noll-normalised (unit variance on the unit circle), float64.
+
+    Z = sqrt(n + 1) [sqrt 2] rho^|m| R'(rho^2) cos or sin(m theta), with rho^|m| exp(i m theta) = (x + iy)^|m|: a
+    polynomial, so value and gradient are finite on the axis.
+    """
+    total = torch.zeros_like(pupil.rho2)
+    rho2 = pupil.rho2
+    x, y = torch.broadcast_tensors(pupil.x, pupil.y)
+    powers = {0: (torch.ones_like(rho2), torch.zeros_like(rho2))}
+    for index, coefficient in enumerate(float64(coefficients).unbind()):
+        n, m = noll_indices(index + 1)
+        order = abs(m)
+        for k in range(1, order + 1):
+            if k not in powers:
+                re, im = powers[k - 1]
+                powers[k] = (re * x - im * y, re * y + im * x)
+        radial = torch.zeros_like(rho2)
+        term = 1.0  # coefficients of R_n^m by their ratio, highest power first (Horner)
+        half = (n - order) // 2
+        for s in range(half + 1):
+            radial = radial * rho2 + term
+            term *= -((n - s - half) * (half - s)) / ((s + 1) * (n - s)) if n > s else 0.0
+        scale = _zernike_scale(n, m)
+        total = total + coefficient.to(rho2.device) * scale * radial * powers[order][1 if m < 0 else 0]
+    return total
+
+
+def _zernike_scale(n: int, m: int) -> float:
+    """Leading coefficient of R_n^m times Noll's normalisation."""
+    order = abs(m)
+    leading = 1.0
+    half_sum, half_difference = (n + order) // 2, (n - order) // 2
+    for i in range(1, half_difference + 1):  # binomial(n, half_difference) = n! / (half_sum! half_difference!)
+        leading *= (half_sum + i) / i
+    return leading * (n + 1) ** 0.5 * (2**0.5 if m else 1.0)

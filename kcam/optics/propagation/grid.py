@@ -1,0 +1,337 @@
+"""PSFs by a transform of a Cartesian pupil grid: a matrix product, a chirp-z transform or an FFT."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from kcam.optics.numerics import fast_length
+from kcam.optics.propagation import sampling
+from kcam.optics.propagation.cells import Cells
+from kcam.optics.propagation.curved import Curvature, CurvedTransform, mean_slope
+from kcam.optics.propagation.estimates import ROUNDING, grid_error, paraxial_error, trace
+from kcam.optics.propagation.intensity import pupil_intensity
+from kcam.optics.propagation.question import Query, residual_path
+from kcam.optics.propagation.row import FFT_SLOWNESS, PRODUCTS, Propagator
+from kcam.optics.propagation.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Transform
+from kcam.optics.pupil.coordinates import EDGE_MARGIN, Pupil, from_image_side, grid_nodes, grid_spacing
+from kcam.optics.pupil.quadrants import unfold
+from kcam.optics.pupil.rim import disc_weights
+from kcam.optics.pupil.warp import Warp
+
+_GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
+_MAP_SETUP = 2e5  # operations for each pupil sample, of weights that bring a map onto a new grid; measured on a CPU
+
+
+def grid_psf(query: Query, *, method: str) -> Tensor:
+    """PSFs by a transform of a Cartesian pupil grid: `matrix`, `chirp_z` or `fft`; (Z, L, H, W)."""
+    bands: list[Tensor] = [torch.empty(0)] * query.wavelengths.numel()
+    for members, count, per_pixel in _groups(query, method=method):
+        images = _grid_group(query, members, count=count, per_pixel=per_pixel, method=method)
+        for index, image in zip(members, images.unbind(0), strict=True):
+            bands[index] = image
+    return torch.stack(bands, dim=1)
+
+
+def samples_by_rule(query: Query, index: int) -> int:
+    """Pupil samples for a wavelength of a query by the rule of `sampling.pupil_samples`, however many."""
+    needed = sampling.pupil_samples(**_geometry(query, index), kappa=query.kappa)
+    if query.has_pixel_phase:  # few distinct grids: each needs weights of its own for the map
+        step = max(64, 2 ** (needed.bit_length() - 4))
+        needed = step * math.ceil(needed / step)
+    return needed
+
+
+def sample_counts(query: Query) -> list[int]:
+    """Pupil samples for each wavelength, as given or by the rule, also where so many would be refused."""
+    return [query.samples or samples_by_rule(query, index) for index in range(len(query.wavelengths))]
+
+
+def _geometry(query: Query, index: int) -> dict[str, float]:
+    return {
+        "semi_aperture": query.scale[0],
+        "sensor_distance": query.scale[1],
+        "wavelength": float(query.wavelengths[index]),
+        "half_window": query.half_window,
+        "displacement": float(query.displacement[index]),
+    }
+
+
+def _checked_samples(query: Query, index: int) -> int:
+    """Pupil samples for a wavelength: the rule's, or the user's after a check that no replica enters the window.
+
+    Raises: ValueError with the sampling that would do.
+    """
+    geometry, needed = _geometry(query, index), samples_by_rule(query, index)
+    if query.samples is None:
+        if needed > sampling.MAX_PUPIL_SAMPLES:
+            raise ValueError(
+                f"this PSF needs {needed} pupil samples at {geometry['wavelength'] * 1e9:.4g} nm (blur "
+                f"{geometry['displacement'] * 1e3:.3g} mm, window {2 * query.half_window * 1e3:.3g} mm), more than "
+                f"the limit of {sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape, method='radial', or "
+                "propagator='geometric'."
+            )
+        return needed
+    if sampling.kappa_of(query.samples, **geometry) <= 1:
+        raise ValueError(
+            f"a pupil of {query.samples} samples is too coarse at {geometry['wavelength'] * 1e9:.4g} nm: its replicas "
+            f"would enter the window. Use samples >= {needed}, or leave samples out."
+        )
+    return query.samples + query.samples % 2
+
+
+def _groups(query: Query, *, method: str) -> Iterator[tuple[list[int], int, float]]:
+    """Wavelengths that share a grid: (their indices, pupil samples, points per pixel)."""
+    groups: dict[tuple[int, float, int], list[int]] = {}
+    for index, wavelength in enumerate(query.wavelengths.tolist()):
+        count = _checked_samples(query, index)
+        own_grid = index if method == "fft" else -1  # its pupil grid scales with the wavelength
+        groups.setdefault((count, query.evaluation_grid(wavelength)[0], own_grid), []).append(index)
+    for (count, per_pixel, _), members in groups.items():
+        points = 2 * math.ceil(per_pixel * query.half_pixels) + 1
+        each = 2 * count**2 + 3 * query.vergences.numel() * points**2  # numbers held for each wavelength
+        length = max(1, _GROUP_NUMBERS // each)
+        for first in range(0, len(members), length):
+            yield members[first : first + length], count, per_pixel
+
+
+def _grid_group(query: Query, members: list[int], *, count: int, per_pixel: float, method: str) -> Tensor:
+    wavelengths = query.wavelengths[members].to(query.device)
+    wavenumbers = 2 * math.pi / wavelengths
+    curved = _curved(query)
+    semi_aperture = query.semi_aperture if curved else query.image_side_semi_aperture
+    slope = mean_slope(float(query.tau.detach())) if curved else 1.0
+    scales = wavenumbers * semi_aperture / query.sensor_distance
+    step = query.pixel_pitch / per_pixel
+    reach = math.ceil(per_pixel * query.half_pixels)
+    like = torch.empty(0, dtype=query.dtype, device=query.device)
+
+    spacing, length = grid_spacing(count), 0
+    if method == "fft":
+        count, length, spacing = _fft_grid(query, members[0])
+    nodes = grid_nodes(count, spacing=spacing)
+
+    def straight(scale: float) -> Transform:
+        if method == "fft":
+            return FFTTransform(count, length, reach)
+        build = MatrixTransform.build if method == "matrix" else ChirpZTransform.build
+        return build(nodes, scale=scale * slope, step=step, reach=reach, like=like)
+
+    kernels = [straight(float(scale)) for scale in scales.detach()]
+    if curved:
+        kernels = _curve(query, kernels, scales, nodes, step=step, reach=reach, like=like)
+
+    along = (nodes[count // 2 :] if query.lens.even else nodes).to(query.device)
+    x, y = along[None, :], along[:, None]
+    pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
+    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
+    amplitude = _amplitude(query, pupil, curved=curved)
+    cell_area = (semi_aperture * spacing) ** 2
+    cells = Cells.of(query, wavelengths, count=count, spacing=spacing)
+    if cells is None:
+        quadrant = _disc_weights(query, count=count, spacing=spacing)
+        weights, share = (quadrant, 4) if query.lens.even else (unfold(quadrant), 1)
+        energy = share * (weights * amplitude**2).sum((-2, -1)) * cell_area
+        amplitude, field = weights * amplitude, None
+    else:  # they hold the aperture, for its rim cuts their pixels
+        energy = cells.energy(query.semi_aperture, 0 * query.vergences[:1] if query.paraxial else query.vergences)
+        field = _pixel_field(query, cells, kernels[0], count=count, spacing=spacing, curved=curved)
+    intensity = pupil_intensity(
+        (wavenumbers[:, None, None] * coefficients).to(query.dtype),
+        maps=maps.to(query.dtype),
+        amplitude=amplitude.to(query.dtype),
+        field=field,
+        scales=scales.to(query.dtype),
+        transforms=kernels,
+        nodes=nodes,
+        points=torch.arange(-reach, reach + 1, dtype=torch.float64) * step,
+        tau=query.tau if curved else None,
+    )
+    # |sum w P|^2 -> share of the energy per pixel: (a^2 h^2)^2 p^2 / (lambda d)^2 / E
+    factor = (cell_area * query.pixel_pitch / (wavelengths * query.sensor_distance)[:, None]) ** 2 / energy
+    image = kernels[0].to_pixels(intensity, query.pixels(per_pixel))
+    return image * factor[..., None, None].to(query.dtype)
+
+
+def _curve(
+    query: Query, kernels: list[Transform], scales: Tensor, nodes: Tensor, *, step: float, reach: int, like: Tensor
+) -> list[Transform]:
+    """The kernels of a group, curved as far as each needs it."""
+    tau = float(query.tau.detach())
+    strengths = [float(scale) * max(reach, 1) * step for scale in scales.detach()]
+    corner = 1.0 if query.lens.round else math.sqrt(2)
+    orders = [Curvature.order_for(strength, tau=tau, error=1e-8, corner=corner) for strength in strengths]
+    shared = Curvature.build(kernels[0], nodes, tau=tau, step=step, reach=reach, order=max(orders), like=like)
+    return [CurvedTransform(*parts) for parts in zip(kernels, itertools.repeat(shared), strengths, orders)]
+
+
+def _curved(query: Query) -> bool:
+    return query.curved_kernel and query.lens.has_pixels and not query.paraxial
+
+
+def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
+    """(pupil samples, length, spacing) for a wavelength: of the FFT whose bins fall on the points."""
+    wavelength, displacement = float(query.wavelengths[index]), float(query.displacement[index])
+    per_pixel, reach = query.evaluation_grid(wavelength)
+    step = query.pixel_pitch / per_pixel
+    semi_aperture, distance = query.scale
+    if _curved(query):
+        semi_aperture = float(query.semi_aperture.detach()) * mean_slope(float(query.tau.detach()))
+    shortest = max(math.ceil(2 * query.kappa * (query.half_window + displacement) / step), 2 * reach + 1)
+    scale_step = 2 * math.pi * semi_aperture * step / (wavelength * distance)
+    length = fast_length(shortest)
+    while True:
+        spacing = 2 * math.pi / (length * scale_step)
+        count = 2 * math.ceil(1 / spacing + EDGE_MARGIN)
+        if count <= length:
+            return count, length, spacing
+        length = fast_length(count)  # a longer transform has finer samples, and so more of them
+
+
+def _amplitude(query: Query, pupil: Pupil, *, curved: bool) -> Tensor:
+    """Obliquity and source amplitude on the pupil's points, (1 or Z, ...)."""
+    if query.paraxial:
+        return torch.ones_like(pupil.rho2)[None]
+    # a spherical wave's amplitude falls as 1 / R over the pupil: 1 / sqrt(1 + V^2 r^2)
+    falloff = torch.rsqrt(1 + query.vergences[:, None, None] ** 2 * pupil.rho2 * query.semi_aperture**2)
+    # the Debye map's amplitude is `measure` in the image-side plane; d^2 u' / d^2 u is measure^-2
+    return falloff * (1 / pupil.measure if curved else pupil.measure)
+
+
+def _disc_weights(query: Query, *, count: int, spacing: float) -> Tensor:
+    """Quadrature weights of an aperture made of discs, for x, y > 0."""
+    weights = torch.zeros(count // 2, count // 2, dtype=torch.float64)
+    for radius, weight in query.lens.aperture.discs():
+
+        def rim(tau: float, radius: float = radius) -> Tensor:
+            image_side = radius * math.sqrt((1 + tau) / (1 + tau * radius**2))
+            return disc_weights(count, spacing=spacing, radius=image_side)
+
+        weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
+    return weights.to(query.device)
+
+
+def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: float) -> Tensor:
+    """evaluate(tau), with the gradient to tau by a central difference where tau has one (value unchanged).
+
+    tau moves edges on the image-side grid by up to 0.19 tau semi-apertures: the step moves them by a twentieth of a
+    sample.
+    """
+    value = evaluate(float(tau.detach()))
+    if not (tau.requires_grad and torch.is_grad_enabled()):
+        return value
+    step = 0.05 * spacing / 0.19
+    with torch.no_grad():
+        slope = (evaluate(float(tau) + step) - evaluate(float(tau) - step)) / (2 * step)
+    return value + ((tau - tau.detach()) * slope).to(value)
+
+
+def _pixel_field(query: Query, cells: Cells, layout: Transform, *, count: int, spacing: float, curved: bool) -> Tensor:
+    """The pixel maps' transmission and phase on the pupil grid: real and imaginary part (2, L, ...) in a transform's
+    layout.
+    """
+
+    def both(tau: float) -> Tensor:
+        return cells.field(_warp(query, tau, count=count, spacing=spacing, curved=curved), layout)
+
+    return _following(query.tau, both, spacing=spacing)
+
+
+def _warp(query: Query, tau: float, *, count: int, spacing: float, curved: bool) -> Warp | None:
+    """The way from the true pupil plane to the image-side plane, where the kernel needs it."""
+    if curved or query.paraxial:
+        return None
+    corner = 1.05 if query.lens.round else 1.05 * math.sqrt(2)
+    return Warp.build(count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device)
+
+
+def _error(query: Query, *, method: str) -> float:
+    semi_aperture, distance = query.scale
+    worst = 0.0
+    for rays in trace(query):
+        index = int((query.wavelengths - rays.wavelength).abs().argmin())
+        if method == "fft":
+            _, length, _ = _fft_grid(query, index)
+            period = length * query.pixel_pitch / query.evaluation_grid(rays.wavelength)[0]
+        else:
+            count = query.samples or samples_by_rule(query, index)
+            period = rays.wavelength * distance * (count - 2 * EDGE_MARGIN) / (2 * semi_aperture)
+        rounding = ROUNDING[query.dtype] * (5 if method == "fft" else 1)
+        error = grid_error(query, rays, period=period) + paraxial_error(rays, query)
+        worst = max(worst, rounding + error)
+    return min(2.0, worst)
+
+
+def matrix_cost(query: Query) -> float:
+    """Operations of two matrix products for each PSF, and of 24 for each of its pupil samples."""
+    return query.vergences.numel() * sum(2 * m * n * (n + m) + 24 * n * n for n, m in _sizes(query))
+
+
+def _chirp_z_cost(query: Query) -> float:
+    total = 0.0
+    for n, m in _sizes(query):
+        length = fast_length(n + m)
+        total += FFT_SLOWNESS * 10 * (n + m) * length * math.log2(length)
+    return query.vergences.numel() * total
+
+
+def _fft_cost(query: Query) -> float:
+    total = 0.0
+    for n, m in _sizes(query):
+        length = max(2 * n, m)
+        total += FFT_SLOWNESS * 10 * length**2 * math.log2(length)
+        if query.lens.has_pixels:
+            total += _MAP_SETUP * n**2  # its grid scales with the wavelength, and each grid needs weights of its own
+    return query.vergences.numel() * total
+
+
+def _sizes(query: Query) -> Iterator[tuple[int, int]]:
+    """(pupil samples, points) on each axis, for each wavelength."""
+    return zip(sample_counts(query), query.points, strict=True)
+
+
+def _needs_fine_points(query: Query) -> str | None:
+    """An FFT as long as its pupil has bins lambda d / 2a apart; coarser points would fold the pupil onto itself.
+
+    And bins that fall on the points ask for up to twice the samples of other transforms.
+    """
+    semi_aperture, distance = query.scale
+    finest = float(query.wavelengths.min()) * distance / (2 * semi_aperture)
+    if query.integrate or query.pixel_pitch < 0.9 * finest:
+        count = max((_fft_grid(query, index)[0] for index in range(len(query.wavelengths))), default=0)
+        if count <= sampling.MAX_PUPIL_SAMPLES:
+            return None
+        return (
+            f"needs {count} pupil samples for bins that fall on the points, more than the limit of "
+            f"{sampling.MAX_PUPIL_SAMPLES}; use method='matrix' or a smaller shape."
+        )
+    return (
+        f"cannot place its bins on points {query.pixel_pitch:g} m apart (needs less than {0.9 * finest:.3g} m); use "
+        "method='matrix', or integrate over the pixels."
+    )
+
+
+def _row(
+    method: str, *, cost: Callable[[Query], float], about: str, valid: Callable[[Query], str | None] | None = None
+) -> Propagator:
+    return Propagator(
+        "nonparaxial",
+        method,
+        function=lambda query: grid_psf(query, method=method),
+        error=lambda query: _error(query, method=method),
+        cost=cost,
+        rate=PRODUCTS,
+        valid=valid,
+        on_grid=method != "fft",
+        about=about,
+    )
+
+
+MATRIX = _row("matrix", cost=matrix_cost, about="split matrix triple product")
+CHIRP_Z = _row("chirp_z", cost=_chirp_z_cost, about="Bluestein's FFTs onto the pixels")
+FFT = _row("fft", cost=_fft_cost, about="one FFT on a grid scaled to the pixels", valid=_needs_fine_points)

@@ -1,0 +1,302 @@
+"""Point spread functions: from the elements of a lens to the energy in each pixel.
+
+    h(x, y) = |U|^2,  U(x) = 1 / (lambda d sqrt(E)) INT A exp(i k W) exp(-i k x.u' / d) d^2 u'
+
+W is the *residual* optical path: source, lens and propagation are each thousands of radians and cancel in focus, so
+their vergences are summed as float64 scalars first. E is the energy that passes the aperture: a PSF sums to the share
+of that light which falls into its window, and is not normalised to 1.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcam.cache import differentiated
+from kcam.optics.elements.element import Element
+from kcam.optics.elements.stack import ElementStack
+from kcam.optics.propagation import sampling
+from kcam.optics.propagation.pixels import Pixels
+from kcam.optics.propagation.rings import Scatter, panels_of, scatter
+from kcam.optics.pupil.coordinates import Pupil, pupil_tau
+
+_SPREAD = 1e-6  # share of the light that the structure of a radius may send beyond the displacement that is sampled
+
+
+@dataclass(frozen=True)
+class Query:
+    """What is asked of a propagator: a lens, where the light comes from, and which pixels to fill.
+
+    wavelengths: (L,) float64 [m]; vergences: (Z,) float64 [1/m], 0 for infinity, may carry gradients.
+    pixel_pitch [m]; shape: (H, W) pixels; integrate: over pixels (else point samples times the pixel's area).
+    active: width of the light-sensitive part of a pixel (square root of the fill factor).
+    samples: across the pupil, or None for the rule of `sampling.pupil_samples` with `kappa`.
+    cells_per_sample: of pixel maps, at least, for each pupil sample and axis: the rim cuts cells by their area.
+    curved_kernel: beyond the paraxial range leave flat pixels in the true pupil plane and curve the kernel, exact and
+        slow, instead of interpolating their field into the plane where the kernel is straight.
+    """
+
+    lens: ElementStack
+    wavelengths: Tensor
+    vergences: Tensor
+    pixel_pitch: float
+    shape: tuple[int, int]
+    dtype: torch.dtype
+    device: torch.device
+    paraxial: bool = False
+    integrate: bool = True
+    active: float = 1.0
+    kappa: float = sampling.KAPPA
+    samples: int | None = None
+    cells_per_sample: float = 1.7
+    curved_kernel: bool = False
+
+    @property
+    def semi_aperture(self) -> Tensor:
+        """a [m], 0-d float64."""
+        return self.lens.aperture.semi_aperture().to(self.device)
+
+    @property
+    def sensor_distance(self) -> Tensor:
+        """d [m], 0-d float64."""
+        return torch.as_tensor(self.lens.sensor_distance, dtype=torch.float64, device=self.device)
+
+    @property
+    def tau(self) -> Tensor:
+        """(a / d)^2, 0 where paraxial."""
+        return pupil_tau(self.semi_aperture, self.sensor_distance, paraxial=self.paraxial)
+
+    @property
+    def image_side_semi_aperture(self) -> Tensor:
+        """a' = a / sqrt(1 + tau) [m]."""
+        return self.semi_aperture / torch.sqrt(1 + self.tau)
+
+    @property
+    def half_window(self) -> float:
+        """From the origin to the edge of what is evaluated [m]."""
+        return self.half_pixels * self.pixel_pitch
+
+    @property
+    def half_pixels(self) -> int:
+        """Pixels from the origin to the edge of what is evaluated."""
+        return max(self.shape) // 2 + (sampling.WINDOW_MARGIN if self.integrate else 0)
+
+    def evaluation_grid(self, wavelength: float) -> tuple[float, int]:
+        """(points per pixel, points from the origin to the edge) at which the intensity of a wavelength is
+        evaluated.
+        """
+        per_pixel = 1.0
+        if self.integrate:
+            semi_aperture, distance = self.scale
+            per_pixel = sampling.points_per_pixel(
+                pixel_pitch=self.pixel_pitch,
+                semi_aperture=semi_aperture,
+                sensor_distance=distance,
+                wavelength=wavelength,
+            )
+        return per_pixel, math.ceil(per_pixel * self.half_pixels)
+
+    @property
+    def points(self) -> list[int]:
+        """On each axis, at which the intensity of each wavelength is evaluated."""
+        return [2 * self.evaluation_grid(wavelength)[1] + 1 for wavelength in self.wavelengths.tolist()]
+
+    @functools.cached_property
+    def scale(self) -> tuple[float, float]:
+        """(a', d) as numbers [m], without a gradient; kept, because sampling rules ask for it at each wavelength."""
+        with torch.no_grad():  # a checkpoint that computes again must find the same graph
+            return float(self.image_side_semi_aperture), float(self.sensor_distance)
+
+    @functools.cached_property
+    def has_pixel_phase(self) -> bool:
+        """Whether the lens has; kept, because sampling rules ask for it at each wavelength."""
+        return self.lens.has_pixel_phase
+
+    @functools.cached_property
+    def displacement(self) -> Tensor:
+        """How far the smooth part of the pupil sends its rays on the sensor, max d |grad W|, (L,) float64 [m].
+
+        Where a profile of rings is part of it, as far as that scatters all but 1e-6 of its light. Without a gradient;
+        kept, because every row of the table that is priced asks for it.
+        """
+        return self.spread(_SPREAD)
+
+    def spread(self, share: float) -> Tensor:
+        """As `displacement`, for another share of the light that a profile of rings may scatter beyond it."""
+        return _ray_displacement(self, share)
+
+    @functools.cached_property
+    def panels(self) -> Tensor:
+        """Edges of the panels of the radius in which the rotationally symmetric path is smooth, from 0 to 1."""
+        return _panels(self)
+
+    @functools.cached_property
+    def scatter(self) -> Scatter | None:
+        """What the rings of the pupil scatter, at the outermost wavelengths and distances; None where it has none."""
+        if not self.lens.has_rings:
+            return None
+        with torch.no_grad():
+            return scatter(self.panels, radial_phase(self))
+
+    def modelled(self, *, paraxial: bool) -> Query:
+        """The same question to the paraxial model or the exact one, with what it has kept: itself, or its other one."""
+        return self if self.paraxial == paraxial else self._other_model
+
+    @functools.cached_property
+    def _other_model(self) -> Query:
+        other = replace(self, paraxial=not self.paraxial)
+        vars(other)["kept"] = self.kept
+        return other
+
+    @functools.cached_property
+    def kept(self) -> dict[str, Any]:
+        """What others have computed that is the same for both models, by name."""
+        return {}
+
+    def aperture_pixels(self) -> Tensor:
+        """The transmission of an aperture that is a map of pixels, (n, n)."""
+        pixels = self.lens.aperture.pixel_map(self.wavelengths)
+        if pixels is None:
+            raise TypeError(f"{type(self.lens.aperture).__name__} has neither discs() nor a pixel_map().")
+        return pixels.values
+
+    def pixels(self, per_pixel: float) -> Pixels:
+        """The pixels that are asked for, over so many points each."""
+        return Pixels(self.shape, per_pixel, active=self.active, integrate=self.integrate)
+
+    def pupil(self, x: Tensor, y: Tensor) -> Pupil:
+        """The pupil at true normalised coordinates."""
+        return Pupil(x, y, self.semi_aperture, self.sensor_distance, self.paraxial, round=self.lens.round)
+
+
+def residual_vergence(query: Query) -> Tensor:
+    """V = 1/z + 1/d + sum of the elements' vergences, (L, Z) float64 [1/m]; 0 in focus."""
+    lens = sum(element.vergence(query.wavelengths.to(query.device)) for element in query.lens.elements)
+    return (lens + 1 / query.sensor_distance)[:, None] + query.vergences[None, :]
+
+
+def residual_path(query: Query, pupil: Pupil, elements: Sequence[Element] | None = None) -> tuple[Tensor, Tensor]:
+    """The residual OPD as (coefficients (L, Z, T), maps (T, ...)), W = coefficients . maps, both float64.
+
+    The first map is rho^2 with V a^2 / 2; then what the image-side and the object-side sphere have beyond their
+    parabolas, then the terms of the elements, or of those that are given. Pixel maps are not part of it.
+    """
+    wavelengths = query.wavelengths.to(query.device)
+    bands, distances = wavelengths.numel(), query.vergences.numel()
+    ones = wavelengths.new_ones(bands, distances)
+    coefficients = [residual_vergence(query) * query.semi_aperture**2 / 2]
+    maps = [pupil.rho2]
+    if not query.paraxial:
+        coefficients.append(ones)
+        maps.append(pupil.beyond_paraxial(1 / query.sensor_distance))
+        for index, vergence in enumerate(query.vergences):
+            if differentiated(vergence) or float(vergence) != 0:
+                coefficients.append(ones * (torch.arange(distances, device=query.device) == index))
+                maps.append(pupil.beyond_paraxial(vergence))
+    for element in query.lens.elements if elements is None else elements:
+        for coefficient, term in element.terms(pupil, wavelengths):
+            coefficients.append(coefficient[:, None] * ones)
+            maps.append(term)
+    return torch.stack(coefficients, dim=-1), _stacked(maps)
+
+
+def _stacked(maps: Sequence[Tensor]) -> Tensor:
+    return torch.stack(torch.broadcast_tensors(*maps))
+
+
+def _outermost(query: Query) -> Query:
+    """The shortest and longest wavelength, the nearest and farthest distance; |grad W| is convex in the vergence."""
+    wavelengths = torch.stack([query.wavelengths.min(), query.wavelengths.max()]).unique()
+    vergences = query.vergences.detach()
+    return replace(query, wavelengths=wavelengths, vergences=torch.stack([vergences.min(), vergences.max()]).unique())
+
+
+def radial_phase(query: Query) -> Callable[[Tensor], Tensor]:
+    """The rotationally symmetric part of the residual phase at true radii (n,), (P, n) [rad], without a gradient.
+
+    P: the outermost wavelengths and distances.
+    """
+    outermost = _outermost(query)
+    elements = [element for element in query.lens.elements if element.symmetric]
+    wavenumbers = 2 * math.pi / outermost.wavelengths.to(query.device)
+
+    def phase(rho: Tensor) -> Tensor:
+        with torch.no_grad():
+            coefficients, maps = residual_path(outermost, query.pupil(rho, torch.zeros_like(rho)), elements)
+            return ((wavenumbers[:, None, None] * coefficients) @ maps).flatten(0, 1)
+
+    return phase
+
+
+def _panels(query: Query) -> Tensor:
+    wavelengths = _outermost(query).wavelengths.to(query.device)
+    known = [torch.tensor([0.0, 1.0], dtype=torch.float64)]
+    unknown = []
+    for element in query.lens.elements:
+        if element.symmetric and element.knots is None:
+            unknown.append(element)
+        elif element.symmetric:
+            known.append(torch.as_tensor(element.knots, dtype=torch.float64))
+    knots = torch.cat(known).to(query.device).unique()
+    knots = knots[(knots >= 0) & (knots <= 1)]
+
+    def phase(rho: Tensor) -> Tensor:
+        with torch.no_grad():
+            pupil = query.pupil(rho, torch.zeros_like(rho))
+            terms = [term for element in unknown for term in element.terms(pupil, wavelengths)]
+            found = [2 * math.pi / wavelengths[:, None] * c[:, None] * m for c, m in terms]
+            return torch.stack([path.expand(wavelengths.numel(), rho.numel()) for path in found])
+
+    if not unknown:
+        return knots
+    trained = any(p.requires_grad for element in unknown for p in element.parameters())
+    return panels_of(phase, knots, first=512 if trained else 32)  # a flat start tells nothing of what may grow
+
+
+def _ray_displacement(query: Query, share: float) -> Tensor:
+    """Of all elements together on a grid; where some are profiles of rings, of those along a radius and of the rest."""
+    lens, outermost = query.lens, replace(_outermost(query), wavelengths=query.wavelengths)
+    with torch.no_grad():
+        side = torch.linspace(-1, 1, 97, dtype=torch.float64, device=query.device)
+        if lens.symmetric:
+            side = side[48:]
+            x, y = side, torch.zeros_like(side)
+        else:
+            x, y = side[None, :], side[:, None]
+        pupil = query.pupil(x, y)
+        rings = query.wavelengths.new_zeros(query.wavelengths.numel())
+        if query.scatter is None:
+            coefficients, maps = residual_path(outermost, pupil)
+        else:
+            rings += _ring_displacement(query, query.scatter, share)
+            others = [element for element in lens.elements if not element.symmetric]
+            terms = [term for element in others for term in element.terms(pupil, query.wavelengths.to(query.device))]
+            if not terms:
+                return rings
+            coefficients = torch.stack([coefficient for coefficient, _ in terms], dim=-1)[:, None]
+            maps = _stacked([term for _, term in terms])
+        inside = (pupil.rho2 <= 1.0001) | (not lens.round)
+        step = float(side[1] - side[0]) * float(query.semi_aperture)
+        gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
+        slope2 = torch.stack([(coefficients.flatten(0, 1) @ g.flatten(1)) ** 2 for g in gradients]).sum(0)
+        slope2 = torch.where(inside.flatten(), slope2, slope2.new_zeros(()))
+        slope = slope2.amax(dim=1).sqrt().view(query.wavelengths.numel(), -1).amax(dim=1)
+        return rings + (slope * query.sensor_distance).cpu()
+
+
+def _ring_displacement(query: Query, scatter: Scatter, share: float) -> float:
+    """Where the steepest ray of the symmetric path lands, or all but a share of what its rings scatter [m]."""
+    edges, outermost = query.panels, _outermost(query)
+    rho = edges[:-1, None] + edges.diff()[:, None] * torch.linspace(0, 1, 13).to(edges)
+    phase = radial_phase(query)(rho.flatten()).unflatten(-1, (-1, 13))
+    slope = (phase.diff() * (12 / edges.diff()[:, None])).abs().amax(dim=(1, 2)) / (2 * math.pi)
+    farthest = torch.maximum(slope, scatter.reach(share)).view(outermost.wavelengths.numel(), -1).amax(1)
+    return float(
+        (farthest.cpu() * outermost.wavelengths).max() * query.sensor_distance.cpu() / query.semi_aperture.cpu()
+    )

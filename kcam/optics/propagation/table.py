@@ -1,0 +1,44 @@
+"""The propagators: one table of the rows that stand in the files of their functions.
+
+`propagator` names the physics and `method` the transform. To add one, write a function from `Query` to (Z, L, H, W) and
+its row in one file, and name it here; contract tests, the default choice, plans and the documentation take it from
+there.
+"""
+
+from __future__ import annotations
+
+from kcam.optics.propagation.grid import CHIRP_Z, FFT, MATRIX
+from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.radial import RADIAL
+from kcam.optics.propagation.rays import RAYS
+from kcam.optics.propagation.reference import REFERENCE
+from kcam.optics.propagation.row import Propagator
+from kcam.optics.propagation.spectrum import ANGULAR_SPECTRUM
+
+_EXACT = (MATRIX, CHIRP_Z, FFT, RADIAL)
+_ROWS = (*_EXACT, *(row.in_fresnel_range() for row in _EXACT), ANGULAR_SPECTRUM, RAYS, REFERENCE)
+PROPAGATORS = {(row.physics, row.method): row for row in _ROWS}
+PHYSICS = tuple(dict.fromkeys(physics for physics, _ in PROPAGATORS))
+
+
+def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method: str | None = None) -> Propagator:
+    """The row that answers a query: the method named, or the cheapest exact one that is valid; a row is itself.
+
+    With `samples` given, the cheapest that has a grid of so many.
+
+    Raises: ValueError for an unknown propagator or method, listing the known ones.
+    """
+    if isinstance(propagator, Propagator):
+        return propagator
+    if propagator not in PHYSICS:
+        raise ValueError(f"unknown propagator {propagator!r}; known: {', '.join(PHYSICS)}.")
+    rows = [row for row in PROPAGATORS.values() if row.physics == propagator]
+    if method is not None:
+        for row in rows:
+            if row.method == method:
+                return row
+        raise ValueError(f"{propagator} has no method {method!r}; known: {', '.join(row.method for row in rows)}.")
+    if query.samples is not None:  # a number of samples asks for a grid that has one
+        rows = [row for row in rows if row.on_grid] or rows
+    valid = [row for row in rows if row.valid_for(query) is None] or rows
+    return valid[0] if len(valid) == 1 else min(valid, key=lambda row: row.cost(query))

@@ -1,0 +1,5 @@
+"""The pupil plane and its samples."""
+
+from kcam.optics.pupil.coordinates import Pupil
+
+__all__ = ["Pupil"]

@@ -1,0 +1,91 @@
+"""Layers of depth: the share of each pixel in each, and how nearer ones hide farther ones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcam.cache import differentiated
+from kcam.optics.rendering.renderer import Renderer
+from kcam.scene import Scene
+
+LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
+_COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
+
+
+def few_values(values: Tensor, *, at_most: int) -> Tensor | None:
+    """The different values, ascending, or None where there are more of them."""
+    flat = values.flatten()
+    sample = flat[:: max(1, flat.numel() // 4096)]  # tells a ramp from planes without sorting all pixels
+    if sample.unique().numel() > at_most:
+        return None
+    found = flat.unique()
+    return found if found.numel() <= at_most else None
+
+
+def alike(scene: Scene) -> list[Tensor]:
+    """Rows of a batch at one distance each, in the order in which distances come first; one list for all but (B,).
+
+    Where a derivative passes through the distances each sample is alone: one PSF for two would share it out.
+    """
+    depth, batch = scene.depth, scene.shape[0]
+    if not isinstance(depth, Tensor) or depth.ndim != 1 or batch < 2:
+        return [torch.arange(batch)]
+    if differentiated(depth):
+        return list(torch.arange(batch)[:, None])
+    groups: dict[float, list[int]] = {}
+    for row, distance in enumerate(depth.tolist()):
+        groups.setdefault(distance, []).append(row)
+    return [torch.tensor(rows) for rows in groups.values()]
+
+
+def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
+    """Share of each pixel in each layer of a map: linear between neighbours, or all in the nearest.
+
+    Args:      vergence: (B, 1, H, W) [1/m]; beyond the layers all is in the last. layers: (Z,) ascending, Z > 1 [1/m].
+    Returns:   (B, Z, H, W), sums to 1 over the layers.
+    """
+    layers = layers.to(vergence.device)
+    before = torch.searchsorted(layers.detach(), vergence.detach().contiguous(), right=True) - 1
+    before = before.clamp(0, layers.numel() - 2)
+    low, high = layers[before], layers[before + 1]
+    position = (before + (vergence - low) / (high - low)).clamp(0, layers.numel() - 1)
+    position = position if interpolate else position.round()
+    index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
+    return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
+
+
+class Layers:
+    """Depth layers from far to near: each is blurred with its own coverage and laid over what is behind it.
+
+    E_k = K_k * sum_(j <= k) m_j,   l_k = (h_k * m_k I) / E_k,   a_k = (K_k * m_k) / E_k,   out <- l_k + (1 - a_k) out
+
+    with K_k the PSFs of layer k weighted by the channel's filter, relative to their own sum: coverage per *channel*, so
+    that the sum over wavelengths stays inside the transform. Dividing by E_k, the share of what is not hidden by nearer
+    layers, extends each layer behind those, whose blurred edge would otherwise show black. The nearest layer has
+    E = 1: its blurred mask covers what is behind. Where all layers share one PSF this is exactly the plain
+    convolution. Without occlusion the layers are added up as they are.
+    Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
+    """
+
+    def __init__(self, planes: Tensor, shares: Tensor | None, *, occlusion: bool = True) -> None:
+        self.planes, self.shares, self.occlusion = planes, shares, occlusion
+        self.light: Tensor = planes.new_zeros(())
+        self._unhidden = planes.new_zeros(())  # pixels that lie in the layers so far
+
+    def add(self, renderer: Renderer, *, first: int) -> None:
+        """Lay the layers of one bank of PSFs, `first` and the following, over those before."""
+        if self.shares is None:
+            self.light = renderer.blur(self.planes, layer=0)
+            return
+        for layer in range(renderer.psfs.shape[0]):
+            share = self.shares[:, first + layer : first + layer + 1]
+            light = renderer.blur(self.planes * share, layer=layer)
+            if not self.occlusion:
+                self.light = self.light + light
+                continue
+            self._unhidden = self._unhidden + share
+            cover, unhidden = renderer.coverage(torch.cat([share, self._unhidden]), layer=layer).chunk(2)
+            floor = unhidden.clamp(min=_COVERAGE_FLOOR)
+            opacity = (cover / floor).clamp(0, 1)
+            self.light = light / floor + (1 - opacity) * self.light

@@ -1,0 +1,66 @@
+"""From the planes of a scene and a bank of PSFs to the light in each channel, with the work that this is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from kcam.effects import Work
+from kcam.optics.rendering.convolution import correlate
+from kcam.optics.rendering.ways import Bank, choose
+
+_NEAR = 2**20  # pixels beyond which a plane is no longer near the processor
+
+
+class Renderer(Bank):
+    """Convolves pictures (B, K, H, W) with a bank of PSFs (Z, G, h, w), contracted to the channels. Args: as `Bank`."""
+
+    def blur(self, planes: Tensor, *, layer: int) -> Tensor:
+        """The scene's planes (B, K, H, W) through the PSFs of one layer: (B, C, H, W)."""
+        return self.in_squares(planes, choose(self).blur(self, self.psfs[layer]))
+
+    def coverage(self, share: Tensor, *, layer: int) -> Tensor:
+        """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
+        bank, psfs = self._of_masks, self.psfs[layer]
+        if self.weights is None:
+            kernels = self.of_bands(psfs)
+        else:
+            kernels = torch.einsum("cg,gyx->cyx", self.grouped(self.weights), psfs)
+        kernels = kernels / kernels.sum((-2, -1), keepdim=True)
+        if self.direct:
+            return correlate(bank.extend(share), kernels[:, None])
+        convolution, transfers = bank.convolution, bank.convolution.transfer(kernels)
+        return bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
+
+    @property
+    def _of_masks(self) -> Bank:
+        """Where zeros lie beyond the picture it is dark there, not empty: what stands at the border goes on."""
+        return replace(self, border="replicate") if self.border == "zero" else self
+
+    def work(self, *, coverage: bool) -> Work:
+        """What one layer of one picture takes, with its coverage or without; of tensors the shapes are enough."""
+        inputs, kernels, products, _, held, touched = choose(self).takes(self)
+        points, pixels, kernel = (math.prod(size) for size in (self.sizes.size, self.picture, self.window))
+        tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
+        if coverage and self.weights is not None:
+            touched += out * self.groups * kernel
+        if self.direct:
+            summed = products + (2 * out if coverage else 0)
+            slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
+            memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
+            touched += float((inputs + 2 * out) * pixels)
+            return Work({"product": float(summed * pixels * kernel * slow), "touch": touched}, memory)
+        transforms = float(tiles * (inputs + out) + kernels)
+        touched += float(tiles * points * (inputs + out + products) + kernels * points)
+        if coverage:
+            ratio = math.prod(self._of_masks.sizes.size) / points
+            transforms += ratio * (tiles * 2 * (1 + out) + out)
+            touched += ratio * tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
+        memory = float(itemsize * (held * points + (inputs + out) * pixels))
+        operations = {"transform": transforms * points * math.log2(max(2, points)), "touch": touched}
+        if pixels > _NEAR:  # whole it is touched again and again in far memory, in tiles once
+            operations["large"] = float(pixels * (inputs + out) * (2 if tiles == 1 else 1))
+        return Work(operations, memory)

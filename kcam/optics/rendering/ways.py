@@ -1,0 +1,247 @@
+"""The ways to render a layer of depth: one table of what is contracted first, each row with what it takes.
+
+    I_c = sum_l kappa_cl (I_l * h_l),   I_l = sum_k S_kl C_k
+
+The sum over wavelengths stands *inside* the Fourier transform: the picture is transformed once per plane of the scene's
+factors, and back once per channel, not once per band. To add a way, write what it does with a `Bank`, what it takes,
+and a row: the choice and a picture's work follow.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import KW_ONLY, dataclass, replace
+from math import inf, prod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from kcam.cache import ValueCache
+from kcam.optics.rendering.borders import extend
+from kcam.optics.rendering.contraction import contract
+from kcam.optics.rendering.convolution import Convolution, correlate
+
+Blur = Callable[[Tensor], Tensor]  # planes (B, K, H, W) to channels (B, C, H, W), of one square
+
+
+@dataclass(eq=False)
+class Bank:
+    """PSFs (Z, G, h, w) of the layers of depth, what mixes planes into channels, and how they are convolved."""
+
+    psfs: Tensor
+    _: KW_ONLY
+    spectra: Tensor | None  # (K, L) of the planes, or None where the planes are the bands
+    weights: Tensor | None  # (C, L) of the channels, or None for all bands
+    picture: tuple[int, int]
+    owner: Tensor | None = None  # (L,) which of the G PSFs each band takes; None where each has its own
+    border: str = "reflect"  # what lies beyond the picture, one of `BORDERS`
+    direct: bool = False  # sum over the window instead of by FFT; with the same result, faster for small windows
+    tile: int | None = None  # side of squares that the picture is cut into [pixels]; with the same result, less memory
+    max_memory: float = 2e9  # bytes that the transforms may take
+    cache: ValueCache | None = None  # for transfer functions, while the optics stay
+
+    def __post_init__(self) -> None:
+        self.layers, self.groups, *window = self.psfs.shape
+        self.window = (window[0], window[1])
+        self.bands = self.groups if self.owner is None else len(self.owner)
+        self.planes = self.bands if self.spectra is None else len(self.spectra)
+        self.channels = self.bands if self.weights is None else len(self.weights)
+        self.square = self.picture  # what is convolved at once
+        if self.tile is not None:
+            self.square = (min(self.tile, self.picture[0]), min(self.tile, self.picture[1]))
+        self.squares = (-(-self.picture[0] // self.square[0]), -(-self.picture[1] // self.square[1]))
+
+    @functools.cached_property
+    def sizes(self) -> Convolution:
+        """Of a square with the picture's border."""
+        itemsize, memory, layers = self.psfs.element_size(), self.max_memory, self.layers
+        return Convolution.of(
+            self.square, self.window, border=self.border, itemsize=itemsize, max_memory=memory, layers=layers
+        )
+
+    @functools.cached_property
+    def convolution(self) -> Convolution:
+        """The transforms of a square: one of several comes with what lies around it."""
+        return self.sizes if self.squares == (1, 1) else replace(self, border="given").sizes
+
+    def extend(self, planes: Tensor) -> Tensor:
+        """The picture with the border that the window reaches."""
+        return extend(planes, self.window, self.border)
+
+    def of_bands(self, psfs: Tensor) -> Tensor:
+        """The PSF of each band, (L, h, w)."""
+        return psfs if self.owner is None else psfs[self.owner.to(psfs.device)]
+
+    def grouped(self, weights: Tensor) -> Tensor:
+        """Weights of the bands, (..., L), added up over those that share a PSF: (..., G)."""
+        if self.owner is None:
+            return weights
+        sums = weights.new_zeros(*weights.shape[:-1], self.groups)
+        return sums.index_add(-1, self.owner.to(weights.device), weights)
+
+    def kappa(self) -> Tensor:
+        """Weights (C, L) of the channels, which without a filter are the bands."""
+        return torch.eye(self.bands).to(self.psfs) if self.weights is None else self.weights
+
+    def mixing(self) -> Tensor:
+        """M_ckg, the sum of kappa_cl S_kl over the bands of a group: (C, K, G)."""
+        spectra = torch.eye(self.bands).to(self.psfs) if self.spectra is None else self.spectra  # bands are planes too
+        return self.grouped(self.kappa()[:, None] * spectra)
+
+    def keeps(self, count: int, *sources: Tensor) -> bool:
+        """Whether so many transfer functions are kept between calls: while they fit, and nothing is trained."""
+        fit = count * prod(self.convolution.size) * self.psfs.element_size() <= self.max_memory / 4
+        return fit and self.layers == 1 and not any(source.requires_grad for source in sources)
+
+    def transfers(self, kernels: Callable[[], Tensor], count: int, *sources: Tensor) -> Tensor:
+        """Transfer functions of so many kernels, kept while what they come from is the same."""
+        if self.cache is None or not self.keeps(count, *sources):
+            return self.convolution.transfer(kernels())
+        return self.cache.get((*sources, self.convolution.size), lambda: self.convolution.transfer(kernels()))
+
+    def in_squares(self, planes: Tensor, blur: Blur) -> Tensor:
+        """The picture in squares, each blurred with what the window reaches around it; or whole."""
+        if self.direct or self.squares == (1, 1):
+            return blur(planes)
+        (height, width), (rows, columns), (h, w), (down, across) = self.picture, self.square, self.window, self.squares
+        extended = self.extend(planes)
+        pad = (0, across * columns + w - 1 - extended.shape[-1], 0, down * rows + h - 1 - extended.shape[-2])
+        extended = torch.nn.functional.pad(extended, pad)
+        lefts = range(0, across * columns, columns)
+        parts = [
+            torch.cat([blur(extended[..., i : i + rows + h - 1, j : j + columns + w - 1]) for j in lefts], dim=-1)
+            for i in range(0, down * rows, rows)
+        ]
+        return torch.cat(parts, dim=-2)[..., :height, :width]
+
+
+class Takes(NamedTuple):
+    """What a way takes for one picture, in planes but for the pixels touched where PSFs or planes are contracted."""
+
+    inputs: int  # transformed
+    kernels: int  # transformed
+    products: int
+    cost: float  # by which the way is chosen, in transforms; ten products take the time of one
+    held: float  # in memory
+    touched: float = 0.0
+
+
+class Way(NamedTuple):
+    """A row: what it takes, and what the PSFs of a layer do to planes, computed once but for what these change."""
+
+    takes: Callable[[Bank], Takes]
+    blur: Callable[[Bank, Tensor], Blur]
+
+
+def _each_takes(n: Bank) -> Takes:
+    held = 4 + n.bands * prod(n.picture) / prod(n.sizes.size)
+    return Takes(n.bands, n.bands, n.bands, cost=0.0 if n.weights is None else inf, held=held)
+
+
+def _each(bank: Bank, psfs: Tensor) -> Blur:
+    """Each band by itself, for a sensor that sees all bands."""
+    spectra, convolution = bank.spectra, bank.convolution
+
+    def direct(planes: Tensor) -> Tensor:
+        light = planes if spectra is None else torch.einsum("bkhw,kl->blhw", planes, spectra)
+        return correlate(bank.extend(light), bank.of_bands(psfs)[:, None], groups=bank.bands)
+
+    def band(planes: Tensor, psf: Tensor, index: int) -> Tensor:
+        plane = planes[:, index] if spectra is None else torch.einsum("bkhw,k->bhw", planes, spectra[:, index])
+        return convolution.back(convolution.transform(plane) * convolution.transfer(psf))
+
+    def blur(planes: Tensor) -> Tensor:
+        of_bands = bank.of_bands(psfs)
+        # between the forward and the backward pass only the results are kept, not 28 spectra
+        run = functools.partial(checkpoint, band, use_reentrant=False) if torch.is_grad_enabled() else band
+        return torch.stack([run(planes, of_bands[index], index) for index in range(bank.bands)], dim=1)
+
+    return direct if bank.direct else blur
+
+
+def _groups_take(n: Bank) -> Takes:
+    parts = n.channels * n.groups
+    touched = parts * n.planes * prod(n.picture) / 8
+    return Takes(parts, n.groups, parts, cost=parts + n.groups, held=3 * n.channels + n.groups, touched=touched)
+
+
+def _groups(bank: Bank, psfs: Tensor) -> Blur:
+    """sum_g h_g (sum_k M_ckg C_k): for few PSFs the planes are contracted, before the transform."""
+    mixing = bank.mixing()
+
+    def parts(planes: Tensor) -> Iterator[Tensor]:
+        return (torch.einsum("ck,bkhw->bchw", mixing[..., index], planes) for index in range(bank.groups))
+
+    def direct(part: Tensor, psf: Tensor) -> Tensor:
+        extended = bank.extend(part).flatten(0, 1)[:, None]
+        return correlate(extended, psf[None, None]).unflatten(0, part.shape[:2]).squeeze(2)
+
+    if bank.direct:
+        return lambda planes: functools.reduce(torch.add, map(direct, parts(planes), psfs))
+    convolution, transfers = bank.convolution, bank.transfers(lambda: psfs, bank.groups, psfs)
+
+    def blur(planes: Tensor) -> Tensor:
+        pairs = zip(parts(planes), transfers, strict=True)
+        return convolution.back(functools.reduce(torch.add, (convolution.transform(p) * t for p, t in pairs)))
+
+    return blur
+
+
+def _kernels_take(n: Bank) -> Takes:
+    kernels = n.channels * n.planes
+    few = kernels <= n.groups  # measured: the kernels' own contraction runs well
+    cost = (0.0 if few else n.planes + kernels) if n.spectra is not None else inf
+    touched = kernels * n.groups * prod(n.window)
+    return Takes(n.planes, kernels, kernels, cost=cost, held=n.planes + kernels + 3 + n.channels, touched=touched)
+
+
+def _kernels(bank: Bank, psfs: Tensor) -> Blur:
+    """sum_k (sum_g M_ckg h_g) C_k: for few channels and planes the PSFs are contracted, not the spectra."""
+    mixing = bank.mixing()
+
+    def kernels() -> Tensor:
+        return torch.einsum("ckg,gyx->ckyx", mixing, psfs)
+
+    if bank.direct:
+        found = kernels()
+        # the picture is upright, so the PSF is turned: a correlation, which is what conv2d computes
+        return lambda planes: correlate(bank.extend(planes), found)
+    convolution = bank.convolution
+    channels = bank.transfers(kernels, bank.channels * bank.planes, psfs, mixing)
+
+    def blur(planes: Tensor) -> Tensor:
+        spectrum = convolution.transform(planes)
+        return torch.stack([convolution.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
+
+    return blur
+
+
+def _bands_take(n: Bank) -> Takes:
+    at_once = min(n.bands, n.sizes.bands)
+    products = n.bands * (1 + n.channels + (0 if n.spectra is None else n.planes))
+    cost = inf if n.direct else n.planes + n.bands + products / 10
+    held = (at_once if n.spectra is None else n.planes) + at_once + 2 * n.channels
+    return Takes(n.planes, n.bands, products, cost=cost, held=held)
+
+
+def _bands(bank: Bank, psfs: Tensor) -> Blur:
+    """sum_l kappa_cl h_l (sum_k S_kl C_k): the spectra are contracted, see `contraction`."""
+    psfs, weights, convolution = bank.of_bands(psfs), bank.kappa(), bank.convolution
+    kept = bank.transfers(lambda: psfs, len(psfs), psfs) if bank.keeps(len(psfs), psfs) else None
+    return lambda planes: contract(planes, psfs, bank.spectra, weights, kept, convolution)
+
+
+WAYS = {
+    "each": Way(_each_takes, _each),
+    "groups": Way(_groups_take, _groups),
+    "kernels": Way(_kernels_take, _kernels),
+    "bands": Way(_bands_take, _bands),
+}
+
+
+def choose(bank: Bank) -> Way:
+    """The cheapest way; the first of those that cost the same."""
+    return min(WAYS.values(), key=lambda way: way.takes(bank).cost)

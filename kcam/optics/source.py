@@ -1,0 +1,95 @@
+"""What a picture asks of optics: PSFs of points of the scene on a sensor's pixels, whoever knows them.
+
+    bank (N, L, h, w) of N source points, at L wavelengths, on pixels h x w
+
+`optics.Lens` computes them, `optics.MeasuredPSF` has them from elsewhere, and `optics.Imaging` takes anything that
+follows the protocol here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+_CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where the light of a bank comes from: N points.
+
+    vergences: (N,) float64, 1 / distance [1/m], 0 for infinity; may carry gradients.
+    positions: (N, 2), where the light falls on the sensor, x and y from its middle [m], +x right and +y down; None for
+        points on the axis.
+    """
+
+    vergences: Tensor
+    positions: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """The pixels that a PSF fills: its window on the sensor; index n // 2 is the origin.
+
+    pitch [m]. shape: (h, w). fill_factor: light-sensitive share of a pixel. integrate: over that share; False takes
+    the value at the centre. dtype, device: of the bank.
+    """
+
+    pitch: float
+    shape: tuple[int, int]
+    fill_factor: float = 1.0
+    integrate: bool = True
+    dtype: torch.dtype = torch.float32
+    device: torch.device = _CPU
+
+
+@dataclass(frozen=True)
+class Defocus:
+    """How far optics send light that is out of focus, in pixels: floor + spread |V - focus|.
+
+    focus: the vergences in focus of the shortest and the longest wavelengths [1/m]. spread [m]. floor: of what is in
+    focus, with aberrations, DOEs and diffraction.
+    """
+
+    focus: tuple[float, float] = (0.0, 0.0)
+    spread: float = 0.0
+    floor: float = 0.0
+
+    def radius(self, vergence: Tensor) -> Tensor:
+        """Radius of the blur of what lies at a vergence [pixels]."""
+        low, high = self.focus
+        return self.floor + self.spread * torch.maximum((vergence - low).abs(), (vergence - high).abs())
+
+
+@runtime_checkable
+class PSFSource(Protocol):
+    """Optics, as `Imaging` asks them; an nn.Module where it trains. To be saved, it keeps its arguments."""
+
+    @property
+    def focus_distance(self) -> float | None:
+        """Where a tensor without a distance is put [m]; None where that is not known."""
+
+    def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
+        """Energy in each pixel (N, L, h, w), >= 0, relative to what passes the optics, as light falls: not turned.
+
+        Whatever the fill factor, a bank sums to the share of the light in its window. wavelengths: (L,) float64 [m].
+        """
+
+    def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
+        """The window (h, w) that holds all but 0.1 % of the light; `pixels.shape` does not count."""
+
+    def defocus_waves(self, wavelengths: Tensor) -> float:
+        """Waves of defocus at the rim for each unit of vergence, at most [m]: how finely depth is cut into layers."""
+
+    def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
+        """How far light is spread, for a planner."""
+
+    def aperture_area(self) -> float | None:
+        """Open area of the aperture [m^2], for exposure in seconds; None where that is not known."""
+
+    @property
+    def sensor_distance(self) -> float | Tensor | None:
+        """From the pupil to the sensor [m], likewise."""
