@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
+from typing import Any, Required, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -32,6 +33,20 @@ to what `explain` states from 4 to 100 mm and f/1.8 to f/64 (tests/optics/test_m
 light where the Debye map does not hold: 0.5 for a plano-convex lens at f/1.4. Slower, pinholes spread it to angles at
 which obliquity counts: 0.07 at f/1000.
 """
+
+
+class PSFArguments(TypedDict, total=False):
+    """What `Lens.psf` takes beside the wavelengths, and all that looks at its PSFs too."""
+
+    distances: Required[Tensor | float]
+    pixel_pitch: Required[float]
+    shape: Required[tuple[int, int]]
+    propagator: str
+    method: str | None
+    samples: int | None
+    fill_factor: float
+    integrate: bool
+    dtype: torch.dtype
 
 
 @dataclass(frozen=True)
@@ -92,8 +107,7 @@ class Lens(ElementStack):
             dtype: of the result, float32 or float64.
         Returns:   (Z, L, H, W), >= 0 up to the sampling error; sums to the share of light in the window.
         Raises:    ValueError for lengths that are not in metres, distances <= 0, an unknown propagator or method, a
-            shape
-                   that is not two positive integers, a pupil too coarse for the window (with the sampling that
+                   shape that is not two positive integers, a pupil too coarse for the window (with the sampling that
                    would do), or a lens whose parameters were trained or loaded into NaN.
         Warns:     UserWarning for an f-number outside `TESTED_F_NUMBERS`.
         Valid on the axis, for thin elements and scalar light; `explain` estimates the error.
@@ -110,37 +124,26 @@ class Lens(ElementStack):
         )
         return choose(query, propagator=propagator, method=method)(query)
 
-    def explain(
-        self,
-        wavelengths: Tensor | list[float],
-        *,
-        distances: Tensor | float,
-        pixel_pitch: float,
-        shape: tuple[int, int],
-        propagator: str = "nonparaxial",
-        method: str | None = None,
-        samples: int | None = None,
-        fill_factor: float = 1.0,
-        integrate: bool = True,
-        dtype: torch.dtype = torch.float32,
-    ) -> Explanation:
+    def explain(self, wavelengths: Tensor | list[float], **arguments: Unpack[PSFArguments]) -> Explanation:
         """What `psf` will do with the same arguments: the row, its sampling, its error, and the energy in the window.
 
         Args: those of `psf`.
         Returns: a value to print; its fields are the numbers. Errors are estimated without computing the PSFs: never
             more than 3 times too small, down to 1e-6, over random cameras. The captured energy is computed.
         """
-        query = self.query(
-            wavelengths,
-            distances=distances,
-            pixel_pitch=pixel_pitch,
-            shape=shape,
-            samples=samples,
-            fill_factor=fill_factor,
-            integrate=integrate,
-            dtype=dtype,
-        )
-        return explain(query, propagator=propagator, method=method)
+        query, how = self._asked(wavelengths, **arguments)
+        return explain(query, **how)
+
+    def _asked(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        propagator: str = "nonparaxial",
+        method: str | None = None,
+        **asked: Any,
+    ) -> tuple[Query, dict[str, Any]]:
+        """The question in the arguments of `psf`, and how it is to be answered."""
+        return self.query(wavelengths, **asked), {"propagator": propagator, "method": method}
 
     def query(
         self,
@@ -192,52 +195,17 @@ class Lens(ElementStack):
             samples=None if samples is None else int(samples),
         )
 
-    def mtf(
-        self,
-        wavelengths: Tensor | list[float],
-        *,
-        distances: Tensor | float,
-        pixel_pitch: float,
-        shape: tuple[int, int],
-        propagator: str = "nonparaxial",
-        method: str | None = None,
-        samples: int | None = None,
-        fill_factor: float = 1.0,
-        integrate: bool = True,
-        dtype: torch.dtype = torch.float32,
-    ) -> Tensor:
+    def mtf(self, wavelengths: Tensor | list[float], **arguments: Unpack[PSFArguments]) -> Tensor:
         """Modulation transfer function, |OTF| / OTF(0) of the light in the window, times the pixel's own sinc.
 
         Args: those of `psf`; integrate=False leaves out the pixel's sinc: the optics alone.
         Returns: (Z, L, H, W) in [0, 1]; index n // 2 is frequency 0, the step is 1 / (n * pixel_pitch) cycles per
             metre.
         """
-        query = self.query(
-            wavelengths,
-            distances=distances,
-            pixel_pitch=pixel_pitch,
-            shape=shape,
-            samples=samples,
-            fill_factor=fill_factor,
-            integrate=integrate,
-            dtype=dtype,
-        )
-        return mtf(query, propagator=propagator, method=method)
+        query, how = self._asked(wavelengths, **arguments)
+        return mtf(query, **how)
 
-    def encircled_energy(
-        self,
-        wavelengths: Tensor | list[float],
-        *,
-        distances: Tensor | float,
-        pixel_pitch: float,
-        shape: tuple[int, int],
-        propagator: str = "nonparaxial",
-        method: str | None = None,
-        samples: int | None = None,
-        fill_factor: float = 1.0,
-        integrate: bool = True,
-        dtype: torch.dtype = torch.float32,
-    ) -> Tensor:
+    def encircled_energy(self, wavelengths: Tensor | list[float], **arguments: Unpack[PSFArguments]) -> Tensor:
         """Share of the light through the aperture that falls within a circle around the origin.
 
         The irradiance is evaluated between the pixels, at a quarter of its Nyquist pitch, and summed with the edge
@@ -246,17 +214,8 @@ class Lens(ElementStack):
         Args: those of `psf`; fill_factor and integrate change nothing, for the irradiance is what counts here.
         Returns: (Z, L, K + 1) for radii k * pixel_pitch, k = 0..K = min(H, W) // 2, rising from 0.
         """
-        query = self.query(
-            wavelengths,
-            distances=distances,
-            pixel_pitch=pixel_pitch,
-            shape=shape,
-            samples=samples,
-            fill_factor=fill_factor,
-            integrate=integrate,
-            dtype=dtype,
-        )
-        return encircled_energy(query, propagator=propagator, method=method)
+        query, how = self._asked(wavelengths, **arguments)
+        return encircled_energy(query, **how)
 
     # ---- as a source of PSFs ---------------------------------------------------------------------------------------
 

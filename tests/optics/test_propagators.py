@@ -384,6 +384,17 @@ def test_fft_refuses_points_that_its_bins_cannot_reach() -> None:
     assert torch.isfinite(lens.psf([550e-9], method="matrix", **arguments)).all()
 
 
+@pytest.mark.parametrize("pitch", [8 * um, 20 * um, 300 * um])
+@pytest.mark.parametrize("row", PROPAGATORS.values(), ids=lambda row: f"{row.physics}-{row.method}")
+def test_an_estimate_ends_where_the_row_refuses(row: Propagator, pitch: float) -> None:
+    """The FFT looked for a length without end."""
+    asked = query(small_lens(), 9, pixel_pitch=pitch, integrate=False)
+    try:
+        assert 0 <= row.error(asked) <= 2
+    except ValueError:
+        assert row.valid_for(asked) is not None
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1.2e-7), (torch.float64, 2.5e-16)])
 def test_sines(monkeypatch: pytest.MonkeyPatch, threads: int, dtype: torch.dtype, error: float) -> None:

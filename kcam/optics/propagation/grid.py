@@ -175,7 +175,10 @@ def _curved(query: Query) -> bool:
 
 
 def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
-    """(pupil samples, length, spacing) for a wavelength: of the FFT whose bins fall on the points."""
+    """(pupil samples, length, spacing) for a wavelength: of the FFT whose bins fall on the points.
+
+    Raises:    ValueError for points so coarse that no length is long enough.
+    """
     wavelength, displacement = float(query.wavelengths[index]), float(query.displacement[index])
     per_pixel, reach = query.evaluation_grid(wavelength)
     step = query.pixel_pitch / per_pixel
@@ -185,6 +188,8 @@ def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
     shortest = max(math.ceil(2 * query.kappa * (query.half_window + displacement) / step), 2 * reach + 1)
     scale_step = 2 * math.pi * semi_aperture * step / (wavelength * distance)
     length = fast_length(shortest)
+    if scale_step >= math.pi:
+        raise ValueError(f"an FFT {_too_coarse(query, math.pi / scale_step * step)}")
     while True:
         spacing = 2 * math.pi / (length * scale_step)
         count = 2 * math.ceil(1 / spacing + EDGE_MARGIN)
@@ -310,8 +315,12 @@ def _needs_fine_points(query: Query) -> str | None:
             f"needs {count} pupil samples for bins that fall on the points, more than the limit of "
             f"{sampling.MAX_PUPIL_SAMPLES}; use method='matrix' or a smaller shape."
         )
+    return _too_coarse(query, 0.9 * finest)
+
+
+def _too_coarse(query: Query, finest: float) -> str:
     return (
-        f"cannot place its bins on points {query.pixel_pitch:g} m apart (needs less than {0.9 * finest:.3g} m); use "
+        f"cannot place its bins on points {query.pixel_pitch:g} m apart (needs less than {finest:.3g} m); use "
         "method='matrix', or integrate over the pixels."
     )
 
