@@ -84,9 +84,10 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
         return kind, code, each(data), list(vars(thing)), each(vars(thing).values())
     if isinstance(thing, np.ndarray | np.generic) and kind.__module__ == "numpy" and not thing.dtype.hasobject:
         return kind, thing.dtype, thing.shape, thing.tobytes()
-    if kind is types.FunctionType and thing.__globals__["__name__"].startswith("kcam."):
+    where = thing.__globals__.get("__name__", "") if kind is types.FunctionType else ""  # code that is run has no name
+    if where.startswith("kcam."):
         closed = [cell.cell_contents for cell in thing.__closure__ or ()]
-        return thing.__globals__["__name__"], thing.__code__, each((thing.__defaults__, thing.__kwdefaults__, closed))
+        return where, thing.__code__, each((thing.__defaults__, thing.__kwdefaults__, closed))
     if kind is ValueCache:
         return kind
     raise Unknown(kind.__name__)

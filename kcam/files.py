@@ -338,7 +338,7 @@ def _arguments(value: Any) -> dict[str, Any]:
         return value.configuration()
     cls = type(value)
     start: Any = cls.__init__
-    if start is not nn.Module.__init__ and start.__module__.partition(".")[0] == "torch":
+    if start is not nn.Module.__init__ and (start.__module__ or "").partition(".")[0] == "torch":
         raise ValueError(
             f"cannot save a {cls.__qualname__}: it inherits the constructor of {start.__qualname__.partition('.')[0]}. "
             "Give it an __init__ of its own, whose arguments it stores as attributes of the same names."
