@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from kcam.units import wavelength_grid
-
-if TYPE_CHECKING:
-    from kcam.sensor.colour_filter import ColourFilter
 
 
 @runtime_checkable
@@ -29,6 +26,20 @@ class Photometric(Protocol):
     @property
     def sensor_distance(self) -> float | Tensor | None:
         """From the pupil to the sensor [m]."""
+
+
+@runtime_checkable
+class Curves(Protocol):
+    """What exposure, white balance and colour matrix ask of a colour filter."""
+
+    def response(self, wavelengths: Tensor) -> Tensor:
+        """Transmission of each channel (C, L)."""
+
+    def contraction(self, wavelengths: Tensor) -> Tensor:
+        """Weights of the bands in each channel, (C, L), widths included."""
+
+    def white(self, wavelengths: Tensor, *, illuminant: Tensor | None = None) -> Tensor:
+        """What a perfect white gives in each channel, (C,)."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +65,7 @@ class Context:
     lens: Photometric | None = None
     pixel_pitch: float = 4e-6
     fill_factor: float = 1.0
-    colour_filter: ColourFilter | None = None
+    colour_filter: Curves | None = None
     pattern: str = "RGGB"
     full_well: float = 10_000.0
     gain: float = 1.0

@@ -127,6 +127,22 @@ def test_imports_inside_data_point_upstream(path: Path) -> None:
             assert there == here or row[there] < row[here], f"data.{here} imports data.{there}, which is downstream"
 
 
+def test_nothing_outside_calls_a_private_name_of_optics() -> None:
+    trees = {path: ast.parse(path.read_text()) for path in FILES}
+    inside = {path for path in FILES if path.is_relative_to(PACKAGE / "optics")}
+    nodes = [node for path in inside for node in ast.walk(trees[path])]
+    private = {node.name for node in nodes if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
+    private |= {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    private = {name for name in private if name.startswith("_") and not name.startswith("__")}
+    assert len(private) > 100
+    for path in set(FILES) - inside:
+        for node in ast.walk(trees[path]):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls"):
+                assert node.attr not in private, f"{path.name}:{node.lineno}: {ast.unparse(node)}"
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("kcam.optics"):
+                assert not any(alias.name.startswith("_") for alias in node.names), f"{path.name}:{node.lineno}"
+
+
 @pytest.mark.parametrize("path", FILES, ids=IDS)
 def test_only_core_dependencies(path: Path) -> None:
     packages = {module.split(".")[0] for module, _ in imports(path)}

@@ -10,7 +10,7 @@ from kornia.color import linear_rgb_to_rgb
 from torch import Tensor, nn
 
 from kcam import spectral
-from kcam.context import Context, Stage
+from kcam.context import Context, Curves, Stage
 from kcam.inputs import ALPHA, channels_last, check_signal, remedy
 from kcam.sensor.colour_filter import ColourFilter
 from kcam.sensor.noise import hold, in_float32, like
@@ -29,7 +29,7 @@ def _default_filter(channels: int) -> ColourFilter:
     return ColourFilter.rgbw() if channels == 4 else kodak
 
 
-def _filter_of(context: Context, channels: int) -> ColourFilter:
+def _filter_of(context: Context, channels: int) -> Curves:
     """The context's filter, or the default one; ValueError unless it has one curve per channel of the signal."""
     colour_filter = context.colour_filter or _default_filter(channels)
     curves = len(colour_filter.response(context.wavelengths))
