@@ -239,14 +239,8 @@ class Lens(ElementStack):
 
     def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT) -> Tensor:
         """PSFs (N, L, h, w) of source points: see `PSFSource`."""
-        query = self.question(points, wavelengths, pixels, recipe)
-        row = recipe.row(query)
-        psfs = row(query)
-        if query.active < 1:
-            # a scene's pixel is a point here: a sensitive part that it hits or misses would gain or lose its light
-            whole = row(replace(query, active=1.0)).sum((-2, -1), keepdim=True)
-            psfs = psfs / psfs.sum((-2, -1), keepdim=True) * whole
-        return psfs
+        query = replace(self.question(points, wavelengths, pixels, recipe), whole=True)
+        return recipe.row(query)(query)
 
     def operations(
         self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT

@@ -19,7 +19,7 @@ from kcam import Camera, optics, sensor
 from kcam.context import Context
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator
-from kcam.optics.propagation.table import choose
+from kcam.optics.propagation.table import PROPAGATORS, choose
 from kcam.scene import Scene
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -748,6 +748,24 @@ def test_a_propagator_of_ones_own() -> None:
     assert relative(stage(scene), F.avg_pool2d(scene.bands(), 3, 1, 1)) < 1e-13
     query = stage.lens.query(scene.wavelengths, distances=1.0, pixel_pitch=stage.pixel_pitch, shape=(3, 3))
     assert choose(query, propagator=row) is row
+
+
+def test_a_fill_factor_computes_a_bank_once() -> None:
+    asked = []
+
+    def counted(query: Query) -> Tensor:
+        asked.append(query)
+        return PROPAGATORS["nonparaxial", "radial"](query)
+
+    row = Propagator("counted", "radial", function=counted, error=lambda q: 0, cost=lambda q: 1)
+    stage = imaging(propagator=row, psf_shape=(9, 9), fill_factor=0.4)
+    wavelengths = cube(depth=1.5, bands=2).wavelengths
+    how = {"vergences": torch.tensor([0.4]), "shape": (9, 9), "like": torch.empty(0, dtype=torch.float64)}
+    psfs = stage.psf_bank(wavelengths, **how)
+    assert len(asked) == 1
+    whole = stage.changed(fill_factor=1.0).psf_bank(wavelengths, **how)
+    assert torch.allclose(psfs.sum((-2, -1)), whole.sum((-2, -1)), rtol=1e-12)
+    assert relative(psfs, whole) > 1e-3
 
 
 def test_a_changed_stage_differs_in_what_was_named() -> None:

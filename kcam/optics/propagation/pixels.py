@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -24,36 +25,47 @@ class Pixels:
     shape: (H, W); the axis goes through the centre of pixel n // 2. per_pixel: points in each, on each axis.
     active: width of the light-sensitive part of a pixel.
     integrate: the mean over that part; False: the value at the centre, of one point a pixel.
+    whole: scaled to the light that whole pixels receive together: of a point, which a sensitive part may hit or miss.
     """
 
     shape: tuple[int, int]
     per_pixel: float = 1.0
     active: float = 1.0
     integrate: bool = True
+    whole: bool = False
 
     def of_image(self, image: Tensor) -> Tensor:
         """(..., H, W) of the intensity (..., 2K + 1, 2K + 1)."""
         reach = image.shape[-1] // 2
         if self.integrate:
-            return apply_linear(image, _Products(*(_box(n, **self._how(reach, image)) for n in self.shape)))
+            pixels = apply_linear(image, _Products(*(_box(n, **self._how(reach, image)) for n in self.shape)))
+            return self._scaled(pixels, lambda same: same.of_image(image))
         top, left = (reach - n // 2 for n in self.shape)
         return image[..., top : top + self.shape[0], left : left + self.shape[1]]
 
     def of_quadrant(self, quadrant: Tensor) -> Tensor:
         """(..., H, W) of an intensity that is even in x and y, given for x, y >= 0: (..., K + 1, K + 1)."""
         own = [abs(i - n // 2) for n in self.shape for i in range(n)]  # which pixel of the quadrant each one repeats
+        pixels = quadrant
         if self.integrate:
             even = (2 * _halves(n, **self._how(quadrant.shape[-1] - 1, quadrant))[0] for n in self.shape)
-            quadrant = apply_linear(quadrant, _Products(*even))
+            pixels = apply_linear(quadrant, _Products(*even))
         height = self.shape[0]
-        return quadrant[..., own[:height], :][..., own[height:]]
+        return self._scaled(pixels[..., own[:height], :][..., own[height:]], lambda same: same.of_quadrant(quadrant))
 
     def of_quadrants(self, quadrants: Tensor) -> Tensor:
         """(..., H, W) of the intensity as `split` gives it, (..., 4, K + 1, K + 1)."""
         if not self.integrate or quadrants.numel() < _FEW:
             return self.of_image(join(quadrants, odd=True))
         rows, columns = (_halves(n, **self._how(quadrants.shape[-1] - 1, quadrants)) for n in self.shape)
-        return apply_linear(quadrants, _Parities(rows, columns, self.shape))
+        pixels = apply_linear(quadrants, _Parities(rows, columns, self.shape))
+        return self._scaled(pixels, lambda same: same.of_quadrants(quadrants))
+
+    def _scaled(self, pixels: Tensor, of: Callable[[Pixels], Tensor]) -> Tensor:
+        if not self.whole or self.active == 1:
+            return pixels
+        whole = of(replace(self, active=1.0, whole=False))
+        return pixels / pixels.sum((-2, -1), keepdim=True) * whole.sum((-2, -1), keepdim=True)
 
     def _how(self, reach: int, like: Tensor) -> dict[str, Any]:
         how = {"per_pixel": self.per_pixel, "reach": reach, "active": self.active}

@@ -36,6 +36,7 @@ class Query:
     wavelengths: (L,) float64 [m]; vergences: (Z,) float64 [1/m], 0 for infinity, may carry gradients.
     pixel_pitch [m]; shape: (H, W) pixels; integrate: over pixels (else point samples times the pixel's area).
     active: width of the light-sensitive part of a pixel (square root of the fill factor).
+    whole: scaled to what whole pixels receive together, see `Pixels`.
     samples: across the pupil, or None for the rule of `sampling.pupil_samples` with `kappa`.
     cells_per_sample: of pixel maps, at least, for each pupil sample and axis: the rim cuts cells by their area.
     curved_kernel: beyond the paraxial range leave flat pixels in the true pupil plane and curve the kernel, exact and
@@ -52,6 +53,7 @@ class Query:
     paraxial: bool = False
     integrate: bool = True
     active: float = 1.0
+    whole: bool = False
     kappa: float = sampling.KAPPA
     samples: int | None = None
     cells_per_sample: float = 1.7
@@ -168,7 +170,7 @@ class Query:
 
     def pixels(self, per_pixel: float) -> Pixels:
         """The pixels that are asked for, over so many points each."""
-        return Pixels(self.shape, per_pixel, active=self.active, integrate=self.integrate)
+        return Pixels(self.shape, per_pixel, active=self.active, integrate=self.integrate, whole=self.whole)
 
     def pupil(self, x: Tensor, y: Tensor) -> Pupil:
         """The pupil at true normalised coordinates."""
