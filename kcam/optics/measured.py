@@ -15,14 +15,15 @@ from torch import Tensor, nn
 
 from kcam.inputs import as_values, describe
 from kcam.optics.elements.element import set_tensor
+from kcam.optics.numerics import bracketed
 from kcam.optics.regions import field_shares
 from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.precision import full_precision
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 _SAME = 1e-6  # relative: two pitches, wavelengths or distances that are one
-_FILE_KEYS = ("psfs", "wavelengths", "distances", "pixel_pitch")
-_FILE_MORE = ("positions", "focus_distance", "aperture_area", "sensor_distance")
+_NEEDED = ("psfs", "wavelengths", "distances", "pixel_pitch")
+_NAMES = (*_NEEDED, "positions", "focus_distance", "aperture_area", "sensor_distance")  # in a file
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class MeasuredPSF(nn.Module):
             raise
         except Exception as error:  # of a damaged file these libraries raise anything
             raise ValueError(f"cannot read {path}: {error}. It is damaged, or no such file.") from error
-        missing = [name for name in _FILE_KEYS if name not in found]
+        missing = [name for name in _NEEDED if name not in found]
         if missing:
             raise ValueError(f"{path} has no {', '.join(missing)}; it holds {', '.join(sorted(found)) or 'nothing'}.")
         given: dict[str, Any] = {}
@@ -256,11 +257,7 @@ class MeasuredPSF(nn.Module):
             for dim, n in zip((-2, -1), pixels.shape, strict=True):
                 psfs = _centred(psfs, n, dim=dim)
             return psfs
-        whole = _over(psfs, pixels.shape, ratio)
-        if active == 1:
-            return whole
-        part = _over(psfs, pixels.shape, ratio, active=active)
-        return part * (whole.sum((-2, -1), keepdim=True) / part.sum((-2, -1), keepdim=True).clamp(min=1e-30))
+        return _over(psfs, pixels.shape, ratio, active=active)
 
 
 def _check_psfs(psfs: Tensor) -> None:
@@ -285,10 +282,7 @@ def _linear(nodes: Tensor, at: Tensor) -> Tensor:
     ordered, order = nodes.sort()
     if len(nodes) == 1:
         return torch.ones(len(at), 1, dtype=at.dtype, device=at.device)
-    at = at.clamp(ordered[0], ordered[-1])
-    low = (torch.searchsorted(ordered, at.detach().contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
-    share = (at - ordered[low]) / (ordered[low + 1] - ordered[low])
-    share = torch.where((share - share.round()).abs() < _SAME, share.round() + 0 * share, share)
+    low, share = bracketed(ordered, at.clamp(ordered[0], ordered[-1]))
     weights = torch.zeros(len(at), len(nodes), dtype=at.dtype, device=at.device)
     rows = torch.arange(len(at), device=at.device)
     return weights.index_put((rows, order[low]), 1 - share).index_put((rows, order[low + 1]), share)
@@ -317,14 +311,16 @@ def _shares(own: int, wanted: int, ratio: float, active: float, even: bool = Fal
 
 
 def _over(psfs: Tensor, shape: tuple[int, int], ratio: float, *, active: float = 1.0, even: bool = False) -> Tensor:
-    """PSFs (..., H, W) on other pixels. Where the spline is below 0 it is cut, and the rest scaled to the sum."""
-    rows, columns = (
-        _shares(own, n, ratio, active, even).to(psfs) for own, n in zip(psfs.shape[-2:], shape, strict=True)
-    )
-    found = rows @ psfs @ columns.mT
-    light = found.clamp(min=0)
-    total = light.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(psfs.dtype).tiny)
-    return light * (found.sum((-2, -1), keepdim=True) / total)
+    """PSFs (..., H, W) on other pixels, scaled to the light that whole ones receive: where the spline is below 0 it is
+    cut, and a sensitive part may hit or miss a point.
+    """
+    sides = tuple(zip(psfs.shape[-2:], shape, strict=True))
+    rows, columns = (_shares(own, n, ratio, active, even).to(psfs) for own, n in sides)
+    inside = (_shares(own, n, ratio, 1.0, even).sum(0).to(psfs) for own, n in sides)
+    light = (rows @ psfs @ columns.mT).clamp(min=0)
+    total = light.sum((-2, -1)).clamp(min=torch.finfo(psfs.dtype).tiny)
+    whole = torch.einsum("...hw,h,w->...", psfs, *inside)
+    return light * (whole / total)[..., None, None]
 
 
 def _left_out(psfs: Tensor, nodes: Tensor) -> float:
@@ -349,7 +345,7 @@ def _difference(first: Tensor, second: Tensor) -> float:
 
 def _from_npz(path: Path) -> dict[str, np.ndarray]:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load loses it where damaged
-        return {name: file[name] for name in (*_FILE_KEYS, *_FILE_MORE) if name in file.files}
+        return {name: file[name] for name in _NAMES if name in file.files}
 
 
 def _from_hdf5(path: Path) -> dict[str, np.ndarray]:
@@ -358,7 +354,7 @@ def _from_hdf5(path: Path) -> dict[str, np.ndarray]:
     except ImportError as error:
         raise ImportError("reading .h5 needs h5py: pip install 'kcam[data]'.") from error
     with h5py.File(path, "r") as file:
-        return {name: np.asarray(file[name]) for name in (*_FILE_KEYS, *_FILE_MORE) if name in file}
+        return {name: np.asarray(file[name]) for name in _NAMES if name in file}
 
 
 def _from_fits(path: Path) -> dict[str, np.ndarray]:
@@ -370,7 +366,7 @@ def _from_fits(path: Path) -> dict[str, np.ndarray]:
         named = {unit.name.lower(): unit for unit in file if unit.name}
         if "psfs" not in named and file[0].data is not None:
             named["psfs"] = file[0]  # the primary HDU is often left without a name
-        return {name: np.asarray(named[name].data) for name in (*_FILE_KEYS, *_FILE_MORE) if name in named}
+        return {name: np.asarray(named[name].data) for name in _NAMES if name in named}
 
 
 _READERS: Mapping[str, Callable[[Path], dict[str, np.ndarray]]] = {

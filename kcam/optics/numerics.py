@@ -90,6 +90,17 @@ def lagrange(offset: Any, *, taps: range) -> list[Any]:
     return weights
 
 
+def bracketed(nodes: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Which of two or more ascending nodes comes before each value, and the value's share of the way to the next.
+
+    Values beyond the outermost nodes belong to the first or the last two, with shares below 0 or above 1.
+    """
+    before = torch.searchsorted(nodes.detach(), at.detach().contiguous(), right=True) - 1
+    before = before.clamp(0, len(nodes) - 2)
+    low, high = nodes[before], nodes[before + 1]
+    return before, (at - low) / (high - low)
+
+
 MOST_NODES = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
 
 

@@ -185,6 +185,18 @@ def test_gradients_to_psfs_and_distance() -> None:
     assert [name for name, _ in some(psfs=psfs, distances=[2.0, 3.0]).named_parameters()] == ["psfs"]
 
 
+@pytest.mark.parametrize("distance", [2.0, 2.4, 3.0])
+def test_a_measured_distance_has_a_gradient_too(distance: float) -> None:
+    """The slope towards the node beside it, which is that of all values between."""
+    psfs = torch.zeros(2, 1, 1, 1, dtype=torch.float64)
+    psfs[:, 0, 0, 0] = torch.tensor([0.2, 0.8])
+    source = optics.MeasuredPSF(psfs, wavelengths=[550 * nm], distances=[2.0, 3.0], pixel_pitch=PITCH)
+    vergence = torch.tensor([1 / distance], dtype=torch.float64, requires_grad=True)
+    pixels = PixelGrid(PITCH, (1, 1), dtype=torch.float64)
+    source.bank(Points(vergence), torch.tensor([550 * nm], dtype=torch.float64), pixels).sum().backward()
+    assert float(vergence.grad) == pytest.approx(0.6 / (1 / 3 - 1 / 2))
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".h5", ".fits"])
 def test_files(suffix: str, tmp_path: Path) -> None:
     known = measured(random_lens(Draw(3)), aperture_area=1e-5, sensor_distance=0.05)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import phasor
+from kcam.optics.numerics import phasor, squared
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.table import choose
 from kcam.optics.pupil.quadrants import unfold
@@ -25,9 +25,8 @@ def mtf(query: Query, *, propagator: str = "nonparaxial", method: str | None = N
         points = _between_pixels(query, wavelength, fine=fine, shape=(height * fine, width * fine))
         image = choose(points, propagator=propagator, method=method)(points)[:, 0]
         otf = torch.fft.fftshift(torch.fft.fft2(image), dim=(-2, -1))
-        magnitude2 = otf.real.square() + otf.imag.square()
         # a floor far below the transform's own rounding: no NaN gradient at the zeros of an MTF
-        modulation = torch.sqrt(magnitude2 + torch.finfo(query.dtype).tiny)
+        modulation = torch.sqrt(squared(otf) + torch.finfo(query.dtype).tiny)
         total = modulation[..., height * fine // 2, width * fine // 2][..., None, None]
         for dim, n in zip((-2, -1), query.shape, strict=True):
             modulation = modulation.narrow(dim, n * fine // 2 - n // 2, n)

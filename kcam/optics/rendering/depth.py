@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcam.cache import differentiated
+from kcam.optics.numerics import bracketed
 from kcam.optics.rendering.renderer import Renderer
 from kcam.scene import Scene
 
@@ -46,10 +47,8 @@ def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) 
     Returns:   (B, Z, H, W), sums to 1 over the layers.
     """
     layers = layers.to(vergence.device)
-    before = torch.searchsorted(layers.detach(), vergence.detach().contiguous(), right=True) - 1
-    before = before.clamp(0, layers.numel() - 2)
-    low, high = layers[before], layers[before + 1]
-    position = (before + (vergence - low) / (high - low)).clamp(0, layers.numel() - 1)
+    before, share = bracketed(layers, vergence)
+    position = (before + share).clamp(0, layers.numel() - 1)
     position = position if interpolate else position.round()
     index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
     return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
