@@ -131,7 +131,7 @@ def _draw_optics(sheet: Sheet, imaging: optics.Imaging, left: float, top: float,
         left += PANEL + APART
     pixels = imaging.pixels(imaging.psf_shape or (255, 255), torch.empty(0))
     points = Points(torch.tensor([1 / distance], dtype=torch.float64))
-    psf = imaging.lens.bank(points, torch.tensor(PSF_WAVELENGTHS, dtype=torch.float64), pixels, **imaging.recipe)[0]
+    psf = imaging.bank(points, torch.tensor(PSF_WAVELENGTHS, dtype=torch.float64), pixels)[0]
     psf = psf.double().cpu()
     psf = plots.centre(psf, plots.reach_of(psf[None], share=plots.SHARE_SHOWN))
     light = plots.percent_or_more(float(psf.sum((-2, -1)).min()))

@@ -12,6 +12,7 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from numbers import Integral
 from typing import Any, Protocol
 
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from kcam.cache import ValueCache, differentiated
-from kcam.context import Context, Stage
+from kcam.context import Context, Curves, Stage
 from kcam.effects import Work
 from kcam.inputs import check_bands, describe
 from kcam.optics.lens import Lens, Recipe
@@ -35,17 +36,13 @@ from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
-OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 COVERAGES = ("channel", "band")
 _RANGE = 4000.0  # of light in one picture that float32's transforms hold to 1e-3; a picture of 8 bits has 3300
 _FEW_BRIGHT, _MUCH_DARK = 0.05, 0.01  # shares of the pixels
 
 
-class Absorber(Protocol):
+class Absorber(Curves, Protocol):
     """What `Imaging` lets absorb its bands inside the transform: a `sensor.ColourFilter`."""
-
-    def contraction(self, wavelengths: Tensor) -> Tensor:
-        """Weights (C, L) of the bands in each channel."""
 
     def finish(self, light: Tensor) -> Tensor:
         """What the filter makes of the channels' light (B, C, H, W)."""
@@ -173,16 +170,14 @@ class Imaging(Stage):
         """What asks for a method that does not exist, or for one where nothing is computed, is refused at once."""
         if isinstance(self.lens, Lens):
             pixels = self.pixels(self.psf_shape or (1, 1), torch.empty(0))
-            query = self.lens.question(Points(torch.zeros(1)), wavelength_grid([550e-9]), pixels, **self.recipe)
+            query = self.lens.question(Points(torch.zeros(1)), wavelength_grid([550e-9]), pixels, self.recipe)
             if self.method is not None:
-                self.recipe["recipe"].row(query)
+                self.recipe.row(query)
             return
-        given = {"propagator": self.propagator != "nonparaxial"}
-        given |= {name: getattr(self, name) is not None for name in ("method", "samples", "kappa")}
-        if any(given.values()):
-            names = ", ".join(f"{name}=" for name, value in given.items() if value)
+        given = ", ".join(f"{field.name}=" for field in fields(Recipe) if getattr(self, field.name) != field.default)
+        if given:
             raise ValueError(
-                f"{names} says how a Lens computes its PSFs; a {type(self.lens).__name__} has them. Leave it out."
+                f"{given} says how a Lens computes its PSFs; a {type(self.lens).__name__} has them. Leave it out."
             )
 
     def provides(self) -> dict[str, Any]:
@@ -291,11 +286,15 @@ class Imaging(Stage):
         return PixelGrid(self.pixel_pitch, shape, self.fill_factor, self.integrate, like.dtype, like.device)
 
     @property
-    def recipe(self) -> dict[str, Recipe]:
-        """What only optics that compute their PSFs are told."""
-        if not isinstance(self.lens, Lens):
-            return {}
-        return {"recipe": Recipe(self.propagator, self.method, self.samples, self.kappa)}
+    def recipe(self) -> Recipe:
+        """How a `Lens` computes its PSFs; other sources have them."""
+        return Recipe(self.propagator, self.method, self.samples, self.kappa)
+
+    def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
+        """PSFs (N, L, h, w) of source points by this stage's recipe, computed anew."""
+        if isinstance(self.lens, Lens):
+            return self.lens.bank(points, wavelengths, pixels, self.recipe)
+        return self.lens.bank(points, wavelengths, pixels)
 
     def computed_lens(self, *, by: str) -> Lens:
         """The lens, for what asks it more than PSFs. Raises: ValueError, which says `by` whom, where there is none."""
@@ -343,7 +342,7 @@ class Imaging(Stage):
 
         def build() -> Tensor:
             pixels = self.pixels(shape, like)
-            psfs = self.lens.bank(points, self._psf_wavelengths(wavelengths), pixels, **self.recipe)
+            psfs = self.bank(points, self._psf_wavelengths(wavelengths), pixels)
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.renormalise else psfs
 
         # the whole stage, lens and all: what the PSFs depend on is not listed by hand
@@ -419,11 +418,10 @@ class Imaging(Stage):
             operations |= {"bank": float(math.ceil(layers / at_once)), "psf": float(layers * groups)}
             if isinstance(self.lens, Lens):
                 pixels = self.pixels(window, planes)
-                operations |= self.lens.operations(Points(vergences), grouped, pixels, **self.recipe)
+                operations |= self.lens.operations(Points(vergences), grouped, pixels, self.recipe)
             bank = float(2 * at_once * groups * window[0] * window[1] * itemsize)
         shares = float(layers * height * width * batch * 16) if layers > 1 else 0.0
-        positions = getattr(self.lens, "positions", None)
-        zones = 1 if positions is None else len(positions)
+        zones = 1 if self._positions is None else len(self._positions)
         operations = {kind: count * zones for kind, count in operations.items()}
         return first + Work(operations, rendering.memory * batch + bank + shares)
 
@@ -461,15 +459,18 @@ class Imaging(Stage):
 
     def _zones(self, planes: Tensor) -> Iterator[tuple[Tensor | None, Tensor]]:
         """Positions on the sensor (1, 2) [m] at which the optics know their PSFs, and what of the light falls there."""
-        positions = getattr(self.lens, "positions", None)
-        if positions is None:
+        if self._positions is None:
             yield None, planes
             return
         picture = (planes.shape[-2], planes.shape[-1])
-        shares = field_shares(positions, pixel_positions(picture, self.pixel_pitch)).to(planes)
-        for position, share in zip(positions, shares.unbind(-1), strict=True):
+        shares = field_shares(self._positions, pixel_positions(picture, self.pixel_pitch)).to(planes)
+        for position, share in zip(self._positions, shares.unbind(-1), strict=True):
             if bool(share.any()):
                 yield position[None], planes * share
+
+    @property
+    def _positions(self) -> Tensor | None:
+        return getattr(self.lens, "positions", None)
 
     def _rendering(self, scene: Scene) -> dict[str, Any]:
         """What a `Renderer` is told beside its tensors."""

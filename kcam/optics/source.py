@@ -14,6 +14,8 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from kcam.context import Photometric
+
 _CPU = torch.device("cpu")
 
 
@@ -65,8 +67,12 @@ class Defocus:
 
 
 @runtime_checkable
-class PSFSource(Protocol):
-    """Optics, as `Imaging` asks them; an nn.Module where it trains. To be saved, it keeps its arguments."""
+class PSFSource(Photometric, Protocol):
+    """Optics, as `Imaging` asks them; an nn.Module where it trains. To be saved, it keeps its arguments.
+
+    One that has PSFs at some vergences alone may say so, `vergences` (Z,) ascending [1/m]: layers of depth lie there.
+    One that has them at places of the sensor says `positions` (F, 2) [m]: pixels between are shared out among these.
+    """
 
     @property
     def focus_distance(self) -> float | None:
@@ -86,10 +92,3 @@ class PSFSource(Protocol):
 
     def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
         """How far light is spread, for a planner."""
-
-    def aperture_area(self) -> float | None:
-        """Open area of the aperture [m^2], for exposure in seconds; None where that is not known."""
-
-    @property
-    def sensor_distance(self) -> float | Tensor | None:
-        """From the pupil to the sensor [m], likewise."""

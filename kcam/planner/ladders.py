@@ -134,9 +134,9 @@ class _View:
         self.blur, self.row = 0.0, None
         if isinstance(lens := imaging.lens, Lens):
             pixels = imaging.pixels(self.window, planes)
-            query = lens.question(Points(ends), scene.wavelengths, pixels, **imaging.recipe)
+            query = lens.question(Points(ends), scene.wavelengths, pixels, imaging.recipe)
             self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
-            self.row = imaging.recipe["recipe"].row(query)
+            self.row = imaging.recipe.row(query)
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.beside = self.few()
 
