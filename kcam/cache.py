@@ -4,7 +4,8 @@ What a value is, is decided here, once, for everything that a lens or a stage ca
 
 - numbers, text, None, dtypes and devices by type and bits, as are tensors and numpy arrays;
 - tuples, lists, dicts and sets by what is in them;
-- modules of kcam and torch.nn by their class and by all that they hold, plain attributes and torch's own alike;
+- modules of kcam and torch.nn by their class and by all that they hold, plain attributes and torch's own alike; so are
+  kcam's dataclasses;
 - kcam's functions by their code and what they closed over.
 
 What else there is cannot be known, and then nothing is kept and all is computed again: other objects and functions
@@ -21,6 +22,7 @@ from __future__ import annotations
 import types
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
@@ -79,7 +81,8 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
         return kind, each(thing)
     if kind in (set, frozenset) and all(type(member) in _PLAIN for member in thing):
         return kind, frozenset((type(member), member) for member in thing)
-    if isinstance(thing, nn.Module) or getattr(kind, "pure", False) is True:
+    record = is_dataclass(kind) and _ours(kind)
+    if record or isinstance(thing, nn.Module) or getattr(kind, "pure", False) is True:
         code, data = _of_classes(kind)
         return kind, code, each(data), list(vars(thing)), each(vars(thing).values())
     if isinstance(thing, np.ndarray | np.generic) and kind.__module__ == "numpy" and not thing.dtype.hasobject:

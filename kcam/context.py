@@ -82,10 +82,10 @@ def arguments_text(module: nn.Module) -> str:
     if callable(configuration):
         held = configuration()
     else:
-        held = vars(module) | dict(module.named_buffers(recurse=False)) | dict(module.named_parameters(recurse=False))
+        own = vars(module) | dict(module.named_buffers(recurse=False)) | dict(module.named_parameters(recurse=False))
+        held = {name: own.get(name) for name in inspect.signature(type(module)).parameters}
     shown = []
-    for name in inspect.signature(type(module)).parameters:
-        value = held.get(name)
+    for name, value in held.items():
         if isinstance(value, Tensor):
             value = f"{value.item():g}" if value.numel() == 1 else tuple(value.shape)
             shown.append(f"{name}={value}")

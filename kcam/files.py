@@ -296,10 +296,7 @@ def _constructor(cls: type) -> dict[str, inspect.Parameter]:
     """The constructor's parameters."""
     if cls.__init__ is nn.Module.__init__:  # type: ignore[misc]
         return {}  # its (*args, **kwargs) only pass through
-    parameters = dict(inspect.signature(cls).parameters)
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        raise TypeError(f"cannot save {cls.__qualname__}: its constructor takes **kwargs. Name its arguments.")
-    return parameters
+    return dict(inspect.signature(cls).parameters)
 
 
 class _Names(dict[str, Any]):
@@ -320,16 +317,17 @@ def fitting_arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
         return dict(values)
     start: Any = cls.__init__  # type: ignore[misc]
     hints = typing.get_type_hints(start, localns=_Names(vars(sys.modules[cls.__module__])))
-    parameters = inspect.signature(cls).parameters
-    fitted = {}
-    for name, value in values.items():
-        if name not in parameters:
-            raise ValueError(f"there is no argument {name!r}")
+    known: dict[str, Any] = {}
+    for name, parameter in inspect.signature(cls).parameters.items():
         expected = hints.get(name, Any)
-        if parameters[name].kind is inspect.Parameter.VAR_POSITIONAL:
-            expected = types.GenericAlias(tuple, (expected, ...))
-        fitted[name] = fitting(value, expected, name)
-    return fitted
+        if typing.get_origin(expected) is typing.Unpack:  # **arguments: Unpack[...], the names and types of a TypedDict
+            known |= typing.get_type_hints(typing.get_args(expected)[0])
+        else:
+            many = parameter.kind is parameter.VAR_POSITIONAL
+            known[name] = types.GenericAlias(tuple, (expected, ...)) if many else expected
+    for name in values.keys() - known.keys():
+        raise ValueError(f"there is no argument {name!r}")
+    return {name: fitting(value, known[name], name) for name, value in values.items()}
 
 
 def _arguments(value: Any) -> dict[str, Any]:
@@ -344,7 +342,9 @@ def _arguments(value: Any) -> dict[str, Any]:
             "Give it an __init__ of its own, whose arguments it stores as attributes of the same names."
         )
     arguments = {}
-    for name in _constructor(cls):
+    for name, parameter in _constructor(cls).items():
+        if parameter.kind is parameter.VAR_KEYWORD:
+            raise TypeError(f"cannot save {cls.__qualname__}: its constructor takes **kwargs. Name its arguments.")
         if not hasattr(value, name):
             raise TypeError(
                 f"cannot save {cls.__qualname__}({name}=): the module does not keep it. Store every "

@@ -286,13 +286,13 @@ def psf_figure(
         distances = [1.0, 3.0, 10.0, math.inf] if not 0 < focus < 1e3 else [0.4 * focus, focus, 2.5 * focus, math.inf]
     colours_at = torch.tensor(wavelengths or [450 * nm, 500 * nm, 550 * nm, 600 * nm, 650 * nm], dtype=torch.float64)
     bands = torch.linspace(420, 720, 28, dtype=torch.float64) * nm
-    shape = imaging.psf_shape or (255, 255)
+    shape = imaging.accuracy.psf_shape or (255, 255)
     arguments: dict[str, Any] = {
         "distances": torch.tensor(distances, dtype=torch.float64),
         "pixel_pitch": pitch,
         "shape": tuple(shape),
-        "propagator": imaging.propagator,
-        "method": imaging.method,
+        "propagator": imaging.accuracy.propagator,
+        "method": imaging.accuracy.method,
     }
     psf = lens.psf(colours_at, fill_factor=imaging.fill_factor, **arguments).detach().double().cpu()
     reach = reach_of(psf, share=SHARE_SHOWN)

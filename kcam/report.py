@@ -129,7 +129,7 @@ def _draw_optics(sheet: Sheet, imaging: optics.Imaging, left: float, top: float,
         _label(sheet, left, top, "DOE phase", caption if largest > 1e-6 else "flat")
         sheet.picture(_coloured("twilight_shifted", phase), left, top, PANEL, PANEL, smooth=False)
         left += PANEL + APART
-    pixels = imaging.pixels(imaging.psf_shape or (255, 255), torch.empty(0))
+    pixels = imaging.pixels(imaging.accuracy.psf_shape or (255, 255), torch.empty(0))
     points = Points(torch.tensor([1 / distance], dtype=torch.float64))
     psf = imaging.bank(points, torch.tensor(PSF_WAVELENGTHS, dtype=torch.float64), pixels)[0]
     psf = psf.double().cpu()

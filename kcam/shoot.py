@@ -88,7 +88,7 @@ def shoot(
     for index, stage in enumerate(stages):
         if isinstance(stage, optics.Imaging):
             check_not_too_near(stage, distance, shape=(height, width))
-            if height * width > LARGE and stage.tile is None:
+            if height * width > LARGE and stage.accuracy.tile is None:
                 stages[index] = stage.changed(tile=TILE)
     camera = Camera(*stages, context=camera.context)
     with torch.no_grad():
@@ -111,7 +111,7 @@ def check_not_too_near(imaging: optics.Imaging, distance: float, *, shape: tuple
         return
     width = 2 * float(lens.aperture.semi_aperture().detach())
     per_vergence = width * float(lens.sensor_distance) / imaging.pixel_pitch  # pixels per 1/m
-    side = min(*shape, *(imaging.psf_shape or ()))
+    side = min(*shape, *(imaging.accuracy.psf_shape or ()))
     focus = 1 / lens.focus_distance
     focal_length = float(lens.focal_length())
     nearest = max(1 / (focus + side / per_vergence), focal_length)

@@ -234,9 +234,9 @@ def settings(
         raise ValueError(f"unknown knob {', '.join(sorted(unknown))}; there are: {', '.join(KNOBS)}.")
     imaging = _imaging(camera)
     query = _query(imaging, scene)
-    row = choose(query, propagator=imaging.propagator, method=imaging.method)
+    row = choose(query, propagator=imaging.accuracy.propagator, method=imaging.accuracy.method)
     result = [Setting("default", _called(row), camera, scene, optics=True, default=True)]
-    if imaging.propagator != "nonparaxial":
+    if imaging.accuracy.propagator != "nonparaxial":
         camera = with_imaging(camera, propagator="nonparaxial", method=None)
     for name, knob in KNOBS.items():
         if knobs is None or name in knobs:
@@ -361,7 +361,7 @@ def _query(imaging: Imaging, scene: Scene) -> Query:
         distances=1 / vergences,
         pixel_pitch=imaging.pixel_pitch,
         shape=window,
-        samples=imaging.samples,
+        samples=imaging.accuracy.samples,
         fill_factor=imaging.fill_factor,
         integrate=imaging.integrate,
         dtype=scene.dtype,
@@ -501,7 +501,7 @@ def _measured(setting: Setting, truth: _Truth, *, longest: float) -> Row:
     row = Row(setting.knob, setting.name, default=setting.default, baseline=setting.baseline)
     imaging, scene = _imaging(setting.camera), setting.scene
     try:
-        if imaging.propagator == "reference":  # its PSFs are known: their time, for all pixels of all bands and layers
+        if imaging.accuracy.propagator == "reference":  # known PSFs: their time, for all pixels, bands and layers
             pixels = math.prod(_query(imaging, scene).shape) / math.prod(truth.query.shape)
             all_of_them = pixels * _psf_count(imaging, scene) / truth.psfs.shape[:2].numel()
             error = truth.convergence.doubled
@@ -530,7 +530,7 @@ def _measured(setting: Setting, truth: _Truth, *, longest: float) -> Row:
 def _psf_count(imaging: Imaging, scene: Scene) -> int:
     """How many PSFs a picture takes."""
     layers = imaging.depth_layers(torch.as_tensor(scene.depth), scene.wavelengths)
-    return len(layers) * min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
+    return len(layers) * min(imaging.accuracy.bands or len(scene.wavelengths), len(scene.wavelengths))
 
 
 def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, longest: float) -> tuple[list[float], float, float]:
@@ -545,7 +545,7 @@ def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, longest: float
     part = torch.tensor([len(truth.bands) // 2])
 
     def compute() -> tuple[Tensor, float]:
-        wanted = scene.wavelengths if imaging.bands else scene.wavelengths[truth.bands[part]]
+        wanted = scene.wavelengths if imaging.accuracy.bands else scene.wavelengths[truth.bands[part]]
         start = time.process_time()
         bank = imaging.changed().psf_bank(wanted, vergences=vergences, shape=shape, like=like)
         return bank, time.process_time() - start
@@ -554,11 +554,11 @@ def _psf_errors(imaging: Imaging, scene: Scene, truth: _Truth, *, longest: float
     if seconds < longest / 3:
         part = torch.arange(len(truth.bands))
         bank, seconds = compute()
-    computed = min(imaging.bands, len(scene.wavelengths)) if imaging.bands else len(part)
+    computed = min(imaging.accuracy.bands, len(scene.wavelengths)) if imaging.accuracy.bands else len(part)
     share = len(vergences) * computed / _psf_count(imaging, scene)
     if seconds < longest / 3 and seconds / share > longest:
         seconds = compute()[1]  # tables that every bank shares are there now
-    bank = (bank[:, truth.bands[part]] if imaging.bands else bank).double()
+    bank = (bank[:, truth.bands[part]] if imaging.accuracy.bands else bank).double()
     inner, expected, beyond = _centred(bank, truth.psfs.shape[-1]), truth.psfs[:, part], truth.beyond[:, part]
     difference = _light((inner - expected).abs()) + (_light(bank) - _light(inner) - beyond).abs()
     return (difference / (_light(expected) + beyond)).flatten().tolist(), seconds, share

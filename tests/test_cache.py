@@ -28,7 +28,7 @@ from torch.nn.utils import parametrize
 
 from kcam import Camera, Context, Scene, optics, sensor
 from kcam.cache import Unknown, ValueCache, value_of
-from kcam.optics import lens as lens_module
+from kcam.optics import accuracy as accuracy_module
 from kcam.optics.propagation.table import choose
 from kcam.optics.propagation.textbook import textbook_row
 from kcam.optics.rendering.renderer import Renderer
@@ -582,7 +582,7 @@ def test_many_random_changes(seed: int) -> None:
 def test_what_promises_is_kept_and_nothing_else(name: str, monkeypatch) -> None:
     """A second picture of the same lens computes no PSF, unless an element has promised nothing."""
     camera, calls = camera_of(name), []
-    monkeypatch.setattr(lens_module, "choose", lambda *args, **named: calls.append(1) or choose(*args, **named))
+    monkeypatch.setattr(accuracy_module, "choose", lambda *args, **named: calls.append(1) or choose(*args, **named))
     plainly(camera, scene_of())
     assert calls
     calls.clear()

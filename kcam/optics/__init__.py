@@ -1,5 +1,6 @@
 """Wave optics: from a point of light to its image on the sensor, and from a scene to the light in each pixel."""
 
+from kcam.optics.accuracy import Accuracy
 from kcam.optics.elements import (
     DOE,
     AnnularAperture,
@@ -26,6 +27,7 @@ __all__ = [
     "DOE",
     "GLASSES",
     "PROPAGATORS",
+    "Accuracy",
     "AnnularAperture",
     "ApertureMap",
     "CircularAperture",

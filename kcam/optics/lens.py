@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from numbers import Integral
 from typing import Any, Required, TypedDict, Unpack
 
@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from kcam.cache import differentiated
+from kcam.optics.accuracy import Recipe
 from kcam.optics.elements.stack import ElementStack
 from kcam.optics.propagation.analysis import encircled_energy, mtf
 from kcam.optics.propagation.explain import Explanation, explain
 from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query, residual_vergence
-from kcam.optics.propagation.row import Propagator
 from kcam.optics.propagation.sampling import MAX_PUPIL_SAMPLES
 from kcam.optics.propagation.table import choose
 from kcam.optics.source import Defocus, PixelGrid, Points
@@ -47,20 +47,6 @@ class PSFArguments(TypedDict, total=False):
     fill_factor: float
     integrate: bool
     dtype: torch.dtype
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How a lens computes its PSFs; arguments: as of `Lens.psf`, and kappa of `sampling.pupil_samples`."""
-
-    propagator: str | Propagator = "nonparaxial"
-    method: str | None = None
-    samples: int | None = None
-    kappa: float | None = None
-
-    def row(self, query: Query) -> Propagator:
-        """The row of the table that answers."""
-        return choose(query, propagator=self.propagator, method=self.method)
 
 
 _DEFAULT = Recipe()

@@ -128,15 +128,15 @@ class _View:
         self.vergences, _ = imaging.layers_of(scene, planes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         self.layers = len(imaging.vergences(scene, depth)) if depth.numel() else 1
-        self.bands = min(imaging.bands or len(scene.wavelengths), len(scene.wavelengths))
+        self.bands = min(imaging.accuracy.bands or len(scene.wavelengths), len(scene.wavelengths))
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
         ends = torch.stack([self.vergences.min(), self.vergences.max()])
         self.blur, self.row = 0.0, None
         if isinstance(lens := imaging.lens, Lens):
             pixels = imaging.pixels(self.window, planes)
-            query = lens.question(Points(ends), scene.wavelengths, pixels, imaging.recipe)
+            query = lens.question(Points(ends), scene.wavelengths, pixels, imaging.accuracy)
             self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
-            self.row = imaging.recipe.row(query)
+            self.row = imaging.accuracy.row(query)
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.beside = self.few()
 
@@ -163,8 +163,8 @@ def _blur(view: _View) -> Iterator[Ladder]:
 
 def _model(view: _View) -> Iterator[Ladder]:
     """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
-    imaging = view.imaging
-    if imaging.propagator != "nonparaxial" or not isinstance(imaging.lens, Lens) or not imaging.lens.has_pixels:
+    lens, propagator = view.imaging.lens, view.imaging.accuracy.propagator
+    if propagator != "nonparaxial" or not isinstance(lens, Lens) or not lens.has_pixels:
         return
     levels = [Level("fresnel", {"propagator": "fresnel"}), Level("nonparaxial", {})]
     yield Ladder("model", levels, view.beside)
@@ -178,16 +178,16 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     lens = imaging.lens
     if view.row is None or not isinstance(lens, Lens) or lens.has_pixel_phase:
         return
-    if not view.row.on_grid or imaging.samples is not None:
+    if not view.row.on_grid or imaging.accuracy.samples is not None:
         return
-    own = imaging.kappa or KAPPA
+    own = imaging.accuracy.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
     yield Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.beside)
 
 
 def _precision(view: _View) -> Iterator[Ladder]:
-    imaging, dtype = view.imaging, view.scene.dtype
-    if imaging.precision == "float64" or (imaging.precision is None and dtype == torch.float64):
+    precision = view.imaging.accuracy.precision
+    if precision == "float64" or (precision is None and view.scene.dtype == torch.float64):
         levels = [Level("float32", {"precision": "float32"}), Level("float64", {})]
         yield Ladder("precision", levels, view.beside)
 
@@ -229,7 +229,7 @@ def _depth(view: _View) -> Iterator[Ladder]:
     top = Level(f"{view.layers} layers", {}, view.layers)
     layers = Ladder("depth", [*levels, top], view.few(layers=False), successive=True)
     yield layers
-    if view.imaging.occlusion:
+    if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
         yield Ladder("occlusion", levels, view.few(layers=False), follows=layers)
 

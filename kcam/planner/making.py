@@ -275,7 +275,7 @@ class _Prices:
 
     def __init__(self, camera: Camera, trials: Trials, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
         self.imaging, self.always = trials.imaging, always
-        self.rates = costs.current_rates("" if self.imaging is None else self.imaging.propagator)
+        self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
         self.scene = scenes[0]
@@ -376,6 +376,6 @@ class _Rows:
         """How the work is split."""
         if self.price.imaging is None:
             return
-        most = self.changes.get("max_memory", self.price.imaging.max_memory)
+        most = self.changes.get("max_memory", self.price.imaging.accuracy.max_memory)
         now, before = (f"{memory / 1e6:.0f} MB" for memory in (self.spent[1], self.price.of({})[1]))
         self._add("memory", now, before, f"max_memory {most / 1e6:.0f} MB")

@@ -10,8 +10,8 @@ from draws import Draw
 from torch import Tensor
 
 from kcam import optics
-from kcam.optics.imaging import _not_negative, wide_range
 from kcam.optics.rendering.borders import BORDERS
+from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um, wavelength_grid
@@ -182,8 +182,8 @@ def test_gradients_beside_a_lamp(factored: bool, ground: float) -> None:
 def test_only_what_cannot_be_below_0_is_not() -> None:
     """A filter with negative weights may give less than nothing; gradients pass whatever is taken away."""
     light = torch.tensor([-1e-9, 0.5, math.inf]).expand(1, 2, 1, 3).clone().requires_grad_()
-    found = _not_negative(light, torch.tensor([[0.3, 0.0], [0.3, -0.1]]))
+    found = not_negative(light, torch.tensor([[0.3, 0.0], [0.3, -0.1]]))
     assert found[0, :, 0].tolist() == [[0.0, 0.5, math.inf], light[0, 1, 0].tolist()]
     found.sum().backward()
     assert torch.equal(light.grad, torch.ones_like(light))
-    assert float(_not_negative(light, None).detach().min()) == 0
+    assert float(not_negative(light, None).detach().min()) == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 from torch import Tensor
 
@@ -52,6 +54,26 @@ def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) 
     position = position if interpolate else position.round()
     index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
     return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
+
+
+def warn_of_few(layers: object, nodes: Tensor, *, vergence: Tensor, defocus_waves: float) -> None:
+    """Warn where a pixel's distance is farther from all given layers than from the next of the rule's.
+
+    Args: layers: as they were given; nodes: their vergences (Z,), ascending. vergence: of the pixels [1/m].
+        defocus_waves: at the rim for each unit of vergence [m].
+    """
+    nodes, vergence = nodes.detach(), vergence.detach().contiguous()
+    after = torch.searchsorted(nodes, vergence).clamp(max=len(nodes) - 1)
+    away = torch.minimum((nodes[after] - vergence).abs(), (vergence - nodes[(after - 1).clamp(min=0)]).abs())
+    worst = float(away.max()) * defocus_waves
+    if worst > LAYER_WAVES / 2 * (1 + 1e-6):
+        distance = float(1 / vergence.flatten()[away.argmax()])
+        warnings.warn(
+            f"layers={layers} lie up to {worst:.3g} waves of defocus from the map's distances (at {distance:.4g} m), "
+            f"and {LAYER_WAVES / 2:g} keep its blur. Take layers=None, or give the distances that count, such as "
+            f"layers=({distance:.4g}, ...).",
+            stacklevel=3,
+        )
 
 
 class Layers:
