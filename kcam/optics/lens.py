@@ -254,7 +254,7 @@ class Lens(ElementStack):
         query = self.question(points, wavelengths, replace(pixels, shape=(1, 1), dtype=torch.float64))
         blur = float((query.spread(OUTSIDE_SHARE / 10) + self.pixel_phase_displacement(query.wavelengths)).max())
         tail = float(wavelengths.max()) * float(query.sensor_distance.detach()) / (2 * math.pi**2 * OUTSIDE_SHARE)
-        side = 2 * math.ceil((blur + tail * self.aperture.rim_per_area()) / pixels.pitch) + 1
+        side = 2 * math.ceil((blur + tail * self.rim_per_area()) / pixels.pitch) + 1
         return side, side
 
     def defocus_waves(self, wavelengths: Tensor) -> float:

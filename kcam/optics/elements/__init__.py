@@ -4,6 +4,7 @@ from kcam.optics.elements.apertures import AnnularAperture, Aperture, ApertureMa
 from kcam.optics.elements.diffractive import DOE, RadialDOE, ZernikeDOE
 from kcam.optics.elements.element import Element, Term
 from kcam.optics.elements.refractive import Defocus, PlanoConvexLens, ThinLens
+from kcam.optics.elements.wavefront import MeasuredPupil
 from kcam.optics.elements.zernike import ZernikeAberration, noll_indices, zernike_sum
 from kcam.optics.pupil.maps import PixelMap
 
@@ -15,6 +16,7 @@ __all__ = [
     "CircularAperture",
     "Defocus",
     "Element",
+    "MeasuredPupil",
     "PixelMap",
     "PlanoConvexLens",
     "RadialDOE",

@@ -160,10 +160,14 @@ class ApertureMap(Aperture):
         return float64(self.transmission).square().mean()
 
     def rim_per_area(self) -> float:
-        closed = torch.nn.functional.pad(float64(self.transmission.detach()), (1, 1, 1, 1))
-        rim = sum(float(closed.diff(dim=dim).square().sum()) for dim in (0, 1))  # a step of T diffracts T^2
-        side = 2 * float(self.semi_aperture().detach())
-        return rim / (float(float64(self.transmission.detach()).square().sum()) * side / self.transmission.shape[-1])
+        closed = torch.nn.functional.pad(self.transmission.detach(), (1, 1, 1, 1))
+        return rim_per_area(closed, pitch=2 * float(self.semi_aperture().detach()) / self.transmission.shape[-1])
+
+
+def rim_per_area(transmission: Tensor, *, pitch: float) -> float:
+    """Length of the rims in a map of flat pixels over its open area [1/m]: a step of T diffracts T^2."""
+    passed = float64(transmission)
+    return sum(float(passed.diff(dim=dim).square().sum()) for dim in (0, 1)) / (float(passed.square().sum()) * pitch)
 
 
 def _check_aperture(value: Scalar, *, name: str) -> None:

@@ -9,14 +9,15 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from kcam.optics.elements.apertures import Aperture
+from kcam.optics.elements.apertures import Aperture, rim_per_area
 from kcam.optics.elements.diffractive import DOE
 from kcam.optics.elements.element import Element, set_scalar
 from kcam.optics.elements.refractive import PlanoConvexLens
 from kcam.optics.numerics import Scalar, float64
-from kcam.optics.pupil.maps import PixelMap
+from kcam.optics.pupil.maps import PixelMap, pixel_under
 from kcam.units import check_distances, check_positive, check_trained, wavelength_grid
 
+_FINE = 1024  # samples on each axis that an area is summed over
 _ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
 
 
@@ -161,9 +162,40 @@ class ElementStack(nn.Module):
         return float(float64(self.sensor_distance).detach() / (2 * self.aperture.semi_aperture().detach()))
 
     def aperture_area(self) -> float:
-        """Open area of the aperture [m^2]."""
+        """Open area of the aperture [m^2], to 1e-3 where a `MeasuredPupil` dims it."""
         side = 2 * float(self.aperture.semi_aperture().detach())
-        return side**2 * float(torch.as_tensor(self.aperture.open_share()).detach())
+        area = side**2 * float(torch.as_tensor(self.aperture.open_share()).detach())
+        return area * self._passed() if self._dimming() else area
+
+    def rim_per_area(self) -> float:
+        """Length of all rims over the open area [1/m]: what diffracts light into the tails of a PSF."""
+        rims = self.aperture.rim_per_area()
+        for pixels in self._dimming():
+            half_width = torch.as_tensor(pixels.half_width).detach()
+            rims += rim_per_area(pixels.values.detach(), pitch=2 * float(half_width) / pixels.values.shape[-1])
+        return rims
+
+    def _dimming(self) -> list[PixelMap]:
+        """Maps of other elements than the aperture that let part of the light pass."""
+        grid = wavelength_grid([self.focus_wavelength])
+        maps = (element.pixel_map(grid) for element in self.elements if element is not self.aperture)
+        return [pixels for pixels in maps if pixels is not None and pixels.factors is None]
+
+    def _passed(self) -> float:
+        """The share of the aperture's light that other elements let pass."""
+        semi = self.aperture.semi_aperture().detach().cpu()
+        axis = ((torch.arange(_FINE, dtype=torch.float64) + 0.5) * (2 / _FINE) - 1) * semi
+        rho2 = (axis[:, None] ** 2 + axis**2) / semi**2
+        light = torch.ones_like(rho2)
+        if discs := self.aperture.discs():
+            light = sum((weight * (rho2 <= radius**2) for radius, weight in discs), torch.zeros_like(rho2))
+        own = self.aperture.pixel_map(wavelength_grid([self.focus_wavelength]))
+        totals = []
+        for pixels in ([] if own is None else [own], self._dimming()):
+            for one in pixels:
+                light = light * pixel_under(one.values.detach().to(axis), one.half_width, axis, semi) ** 2
+            totals.append(float(light.sum()))
+        return totals[1] / totals[0]
 
     def _sensor_distance_for(self, focus_distance: float) -> float:
         power = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0])

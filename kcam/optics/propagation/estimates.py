@@ -175,7 +175,7 @@ def _light(query: Query, rays: Rays, r: np.ndarray) -> np.ndarray:
         density = -np.diff(beyond) / (math.pi * np.diff(radii**2))
         spread = spread + np.interp(r, (radii[1:] + radii[:-1]) / 2, density)
     beyond_rays = np.maximum(r - rays.rim.max(), 0)
-    tail = airy * a * query.lens.aperture.rim_per_area() / (2 * math.pi**3)
+    tail = airy * a * query.lens.rim_per_area() / (2 * math.pi**3)
     return spread + tail / ((r + airy / 2) * (beyond_rays**2 + airy**2))
 
 

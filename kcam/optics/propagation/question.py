@@ -25,6 +25,7 @@ from kcam.optics.propagation import sampling
 from kcam.optics.propagation.pixels import Pixels
 from kcam.optics.propagation.rings import Scatter, panels_of, scatter
 from kcam.optics.pupil.coordinates import Pupil, pupil_tau
+from kcam.optics.pupil.maps import pixel_under
 
 _SPREAD = 1e-6  # share of the light that the structure of a radius may send beyond the displacement that is sampled
 
@@ -167,6 +168,14 @@ class Query:
         if pixels is None:
             raise TypeError(f"{type(self.lens.aperture).__name__} has neither discs() nor a pixel_map().")
         return pixels.values
+
+    def transmission(self, axis: Tensor) -> Tensor:
+        """Amplitude that maps of pixels let pass, the aperture's too, on a square grid with this axis [m]."""
+        passed = torch.ones((), dtype=axis.dtype, device=axis.device)
+        for pixels in self.lens.pixel_maps(self.wavelengths):
+            if pixels.factors is None:
+                passed = passed * pixel_under(pixels.values.to(axis), pixels.half_width, axis, self.semi_aperture)
+        return passed
 
     def pixels(self, per_pixel: float) -> Pixels:
         """The pixels that are asked for, over so many points each."""

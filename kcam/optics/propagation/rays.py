@@ -11,7 +11,6 @@ from kcam.optics.propagation.estimates import ring_turns, trace
 from kcam.optics.propagation.question import Query, residual_path
 from kcam.optics.propagation.radial import LOOKUPS, lookup_cost
 from kcam.optics.propagation.row import Propagator
-from kcam.optics.pupil.maps import pixel_under
 from kcam.optics.pupil.quadrants import unfold
 from kcam.optics.pupil.rim import round_weights
 
@@ -33,12 +32,9 @@ def geometric_psf(query: Query) -> Tensor:
         coefficients, maps = residual_path(query, pupil)
         slopes = [torch.autograd.grad(m.sum(), (x, y), create_graph=True, allow_unused=True) for m in maps]
     slopes_x, slopes_y = (torch.stack([torch.zeros_like(x) if s[i] is None else s[i] for s in slopes]) for i in (0, 1))
+    power = query.transmission(axis * query.semi_aperture) ** 2
     if query.lens.round:
-        quadrant = round_weights(query.lens.aperture.discs(), count, spacing=spacing)
-        power = unfold(quadrant).to(query.device)
-    else:
-        mask = query.aperture_pixels().to(axis)
-        power = pixel_under(mask, None, axis * query.semi_aperture, query.semi_aperture) ** 2
+        power = power * unfold(round_weights(query.lens.aperture.discs(), count, spacing=spacing)).to(query.device)
     power = power.expand(query.vergences.numel(), count, count)
     if not query.paraxial:
         power = power / (1 + query.vergences[:, None, None] ** 2 * pupil.rho2.detach() * query.semi_aperture**2)

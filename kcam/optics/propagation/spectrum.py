@@ -99,20 +99,17 @@ def _spectrum_band(query: Query, index: int, *, count: int, pitch: float) -> Ten
 
 
 def _point_transmission(query: Query, pupil: Pupil, *, pitch: float, count: int) -> tuple[Tensor, Tensor]:
-    """Amplitude and power that the aperture passes on the true pupil plane: edge weights of discs, a look-up in
-    maps.
-    """
-    aperture, a = query.lens.aperture, float(query.semi_aperture.detach())
-    if not aperture.discs():
-        mask = query.aperture_pixels().to(pupil.rho2)
-        inside = (pupil.x.abs() <= 1) & (pupil.y.abs() <= 1)
-        values = pixel_under(mask, None, pupil.x[0] * a, query.semi_aperture) * inside
+    """Amplitude and power that pass on the true pupil plane: edge weights of discs, a look-up in maps."""
+    discs, a = query.lens.aperture.discs(), float(query.semi_aperture.detach())
+    passed = query.transmission(pupil.x[0] * a)
+    if not discs:
+        values = passed * ((pupil.x.abs() <= 1) & (pupil.y.abs() <= 1))
         return values, values**2
     half = min(count // 2, math.ceil(a / pitch) + 8)
-    quadrant = round_weights(aperture.discs(), 2 * half, spacing=pitch / a)
+    quadrant = round_weights(discs, 2 * half, spacing=pitch / a)
     margin = count // 2 - half
     weights = nn.functional.pad(unfold(quadrant).to(query.device), (margin, margin, margin, margin))
-    return weights, weights
+    return weights * passed, weights * passed**2
 
 
 def _error(query: Query) -> float:

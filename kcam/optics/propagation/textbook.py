@@ -107,14 +107,14 @@ def _behind_the_lens(query: Query, index: int, axis: Tensor) -> tuple[Tensor, Te
     pupil = query.pupil(axis[None, :] / a, axis[:, None] / a)
     r2 = axis[:, None] ** 2 + axis**2
     path = torch.zeros_like(r2)
-    inside = (axis.abs() <= a)[:, None] & (axis.abs() <= a)
-    transmission = inside.to(r2)
-    if query.lens.round:
-        discs = query.lens.aperture.discs()
-        transmission = torch.stack([w * (r2 <= (r * a) ** 2) for r, w in discs]).sum(0).to(r2)
+    discs, passed = query.lens.aperture.discs(), query.transmission(axis)
+    inside = ((axis.abs() <= a)[:, None] & (axis.abs() <= a)).to(r2)
+    if discs:
+        inside = torch.stack([w * (r2 <= (r * a) ** 2) for r, w in discs]).sum(0).to(r2)
+    transmission = inside * passed
+    if discs and not passed.ndim:
         area = sum(w * r**2 for r, w in discs) * math.pi * a**2
     else:
-        transmission = transmission * pixel_under(query.aperture_pixels().to(r2), None, axis, a)
         area = transmission.square().sum() * (axis[1] - axis[0]) ** 2
     phase = torch.zeros_like(r2)
     for element in query.lens.elements:
