@@ -26,12 +26,14 @@ from torch.nn import functional as F
 from kcam import isp, measure, sensor, threads
 from kcam.camera import Camera
 from kcam.optics import PROPAGATORS, Imaging
+from kcam.optics.accuracy import Recipe
 from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.reference import Convergence, checked_psf
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.propagation.table import PHYSICS, choose
 from kcam.optics.propagation.textbook import textbook_angular_spectrum_row, textbook_row
+from kcam.optics.source import Points
 from kcam.plain import from_json
 from kcam.planner.plan import ENDS, with_imaging
 from kcam.scene import Scene
@@ -356,16 +358,8 @@ def _query(imaging: Imaging, scene: Scene) -> Query:
     """What a bank of PSFs of this scene asks for: at its nearest and its farthest point."""
     vergences = _vergences(scene)
     window = imaging.psf_window(scene.wavelengths, vergences=vergences, picture=scene.shape[1:])
-    return imaging.computed_lens(by="kcam tradeoff").query(
-        scene.wavelengths,
-        distances=1 / vergences,
-        pixel_pitch=imaging.pixel_pitch,
-        shape=window,
-        samples=imaging.accuracy.samples,
-        fill_factor=imaging.fill_factor,
-        integrate=imaging.integrate,
-        dtype=scene.dtype,
-    )
+    lens, pixels = imaging.computed_lens(by="kcam tradeoff"), imaging.pixels(window, scene.coefficients)
+    return lens.question(Points(vergences), scene.wavelengths, pixels, Recipe(samples=imaging.accuracy.samples))
 
 
 def _vergences(scene: Scene) -> Tensor:
@@ -377,7 +371,7 @@ def _sample_counts(imaging: Imaging, scene: Scene, kappas: Sequence[float]) -> l
     """Pupil samples that each kappa gives at the shortest wavelength, ascending."""
     query = _query(imaging, scene)
     shortest = int(query.wavelengths.argmin())
-    return sorted({samples_by_rule(replace(query, kappa=kappa, samples=None), shortest) for kappa in kappas})
+    return sorted({samples_by_rule(query.sampled(kappa=kappa, samples=None), shortest) for kappa in kappas})
 
 
 # ---- the measurement -------------------------------------------------------------------------------------------------
@@ -445,14 +439,9 @@ class _Truth:
         bands = torch.unique(torch.stack([order[0], order[len(order) // 2], order[-1]]))
         whole = _query(imaging, scene)
         window = (min(window, *whole.shape) - 1) // 2 * 2 + 1  # odd, and no larger than what the picture uses
-        query = replace(
-            whole,
-            wavelengths=scene.wavelengths[bands],
-            shape=(window + 2 * MARGIN, window + 2 * MARGIN),
-            dtype=torch.float64,
-            integrate=True,
-            samples=None,
-        )
+        shape = (window + 2 * MARGIN, window + 2 * MARGIN)
+        query = replace(whole, wavelengths=scene.wavelengths[bands]).sampled(samples=None)
+        query = query.on(shape=shape, dtype=torch.float64, integrate=True)
         start = time.process_time()
         psfs, measured = checked_psf(query)
         seconds = time.process_time() - start

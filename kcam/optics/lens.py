@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Integral
 from typing import Any, Required, TypedDict, Unpack
@@ -12,14 +11,13 @@ from typing import Any, Required, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from kcam.cache import differentiated
 from kcam.optics.accuracy import Recipe
 from kcam.optics.elements.stack import ElementStack
 from kcam.optics.propagation.analysis import encircled_energy, mtf
 from kcam.optics.propagation.explain import Explanation, explain
 from kcam.optics.propagation.grid import samples_by_rule
-from kcam.optics.propagation.question import Query, residual_vergence
-from kcam.optics.propagation.sampling import MAX_PUPIL_SAMPLES
+from kcam.optics.propagation.question import Query, Sampling, residual_vergence
+from kcam.optics.propagation.sampling import KAPPA, MAX_PUPIL_SAMPLES
 from kcam.optics.propagation.table import choose
 from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
@@ -145,41 +143,15 @@ class Lens(ElementStack):
         device: torch.device | None = None,
     ) -> Query:
         """The arguments of `psf`, checked, as one value."""
-        if not isinstance(shape, Sequence) or len(shape) != 2 or not all(_is_count(n) for n in shape):
-            fix = f" Use shape=({shape}, {shape})." if isinstance(shape, int) and shape >= 1 else ""
-            raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.{fix}")
-        if not 0 < fill_factor <= 1:
-            raise ValueError(f"fill_factor {fill_factor:g} must be in (0, 1]: the light-sensitive share of a pixel.")
-        if samples is not None and (not isinstance(samples, Integral) or samples < 32):
-            raise ValueError(f"samples must be an integer >= 32 across the pupil, or None, got {samples!r}.")
-        if samples is not None and samples > MAX_PUPIL_SAMPLES:
-            raise ValueError(
-                f"samples {samples} across the pupil is above the limit of {MAX_PUPIL_SAMPLES}. Leave samples out for "
-                "as many as this PSF needs, or use a smaller shape."
-            )
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}; cast the result instead.")
         if device is None:
             device = next((t.device for t in (*self.parameters(), *self.buffers())), torch.device("cpu"))
-        grid = check_distances(distances).to(device)
+        pixels = PixelGrid(pixel_pitch, shape, fill_factor, integrate, dtype, device)
+        grid = check_distances(distances)
         if grid.ndim > 1 or grid.numel() == 0:
             raise ValueError(
                 f"distances must be a number or a vector (Z,) with Z >= 1, got shape {tuple(grid.shape)}. Use [2.0]."
             )
-        self.check()
-        self._check_f_number()
-        return Query(
-            lens=self,
-            wavelengths=wavelength_grid(wavelengths),
-            vergences=1 / grid.reshape(-1),
-            pixel_pitch=check_pixel_pitch(pixel_pitch),
-            shape=(int(shape[0]), int(shape[1])),
-            dtype=dtype,
-            device=device,
-            integrate=integrate,
-            active=math.sqrt(fill_factor),
-            samples=None if samples is None else int(samples),
-        )
+        return self._question(Points(1 / grid.reshape(-1)), wavelengths, pixels, Recipe(samples=samples))
 
     def mtf(self, wavelengths: Tensor | list[float], **arguments: Unpack[PSFArguments]) -> Tensor:
         """Modulation transfer function, |OTF| / OTF(0) of the light in the window, times the pixel's own sinc.
@@ -207,21 +179,26 @@ class Lens(ElementStack):
 
     def question(self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT) -> Query:
         """What `bank` asks of a propagator."""
-        vergences = points.vergences.to(torch.float64)
-        query = self.query(
-            wavelengths,
-            distances=1 / vergences.detach(),
-            pixel_pitch=pixels.pitch,
-            shape=pixels.shape,
-            samples=recipe.samples,
-            fill_factor=pixels.fill_factor,
-            integrate=pixels.integrate,
-            dtype=pixels.dtype,
-            device=pixels.device,
-        )
-        if differentiated(vergences):  # not through 1 / distance, which has no slope at infinity
-            query = replace(query, vergences=vergences.to(query.device))
-        return query if recipe.kappa is None else replace(query, kappa=recipe.kappa)
+        check_distances(1 / points.vergences.detach())
+        return self._question(points, wavelengths, pixels, recipe)
+
+    def _question(self, points: Points, wavelengths: Tensor | list[float], pixels: PixelGrid, recipe: Recipe) -> Query:
+        samples, kappa = recipe.samples, recipe.kappa
+        if samples is not None and (not isinstance(samples, Integral) or samples < 32):
+            raise ValueError(f"samples must be an integer >= 32 across the pupil, or None, got {samples!r}.")
+        if samples is not None and samples > MAX_PUPIL_SAMPLES:
+            raise ValueError(
+                f"samples {samples} across the pupil is above the limit of {MAX_PUPIL_SAMPLES}. Leave samples out for "
+                "as many as this PSF needs, or use a smaller shape."
+            )
+        if points.positions is not None:
+            raise ValueError("thin elements have one PSF, that on the axis: leave out the positions on the sensor.")
+        check_pixel_pitch(pixels.pitch)
+        self.check()
+        self._check_f_number()
+        points = Points(points.vergences.to(pixels.device, torch.float64))
+        how = Sampling(KAPPA if kappa is None else kappa, None if samples is None else int(samples))
+        return Query(self, wavelength_grid(wavelengths), points, pixels, how)
 
     def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT) -> Tensor:
         """PSFs (N, L, h, w) of source points: see `PSFSource`."""
@@ -290,7 +267,3 @@ class Lens(ElementStack):
                 UserWarning,
                 stacklevel=3,
             )
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, Integral) and int(value) >= 1

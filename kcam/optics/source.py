@@ -8,7 +8,10 @@ follows the protocol here.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -38,6 +41,8 @@ class PixelGrid:
 
     pitch [m]. shape: (h, w). fill_factor: light-sensitive share of a pixel. integrate: over that share; False takes
     the value at the centre. dtype, device: of the bank.
+    Raises: ValueError for a shape that is not two positive integers, a fill factor outside (0, 1], a dtype other than
+        float32 and float64.
     """
 
     pitch: float
@@ -46,6 +51,29 @@ class PixelGrid:
     integrate: bool = True
     dtype: torch.dtype = torch.float32
     device: torch.device = _CPU
+
+    def __post_init__(self) -> None:
+        shape, dtype = self.shape, self.dtype
+        if not isinstance(shape, Sequence) or len(shape) != 2 or not all(map(_is_count, shape)):
+            fix = f" Use shape=({shape}, {shape})." if _is_count(shape) else ""
+            raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.{fix}")
+        if not 0 < self.fill_factor <= 1:
+            raise ValueError(
+                f"fill_factor {self.fill_factor:g} must be in (0, 1]: the light-sensitive share of a pixel."
+            )
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}; cast the result instead.")
+        plain = {"pitch": float(self.pitch), "shape": (int(shape[0]), int(shape[1]))}
+        vars(self).update(plain, fill_factor=float(self.fill_factor))
+
+    @property
+    def active(self) -> float:
+        """Width of the light-sensitive part of a pixel, in pixels."""
+        return math.sqrt(self.fill_factor)
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, Integral) and int(value) >= 1
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from dataclasses import replace
 
 import pytest
 import torch
@@ -77,7 +76,7 @@ def random_query(seed: int) -> Query:
 
 def truth(query: Query) -> torch.Tensor:
     """The reference; where the Hankel form is exact it stands in for the quadrature, 1e-7 away and much faster."""
-    exact = replace(query, dtype=torch.float64)
+    exact = query.on(dtype=torch.float64)
     return PROPAGATORS[("nonparaxial", "radial") if query.lens.symmetric else ("reference", "quadrature")](exact)
 
 
@@ -156,12 +155,12 @@ def test_estimates_hold_for_maps_however_the_rim_cuts_them(
 def test_estimates_hold_for_samples_that_the_user_gives(seed: int, samples: int) -> None:
     asked = random_query(seed)
     row = PROPAGATORS["nonparaxial", "matrix"]
-    asked = replace(asked, samples=samples)
+    asked = asked.sampled(samples=samples)
     try:
         psf = row(asked)
     except ValueError as refusal:
         pytest.skip(str(refusal))
-    answer = truth(replace(asked, samples=None))
+    answer = truth(asked.sampled(samples=None))
     error = float((psf.double() - answer).abs().sum() / answer.abs().sum())
     assert max(error, FLOOR) <= 3 * max(row.error(asked), FLOOR)
 
@@ -199,9 +198,8 @@ def test_a_reference_that_is_not_converged_refuses(monkeypatch: pytest.MonkeyPat
     """Nothing a user can ask for seems to get there, so its sampling is made coarse."""
     monkeypatch.setattr("kcam.optics.propagation.reference._KAPPA", 0.0)
     lens = singlet(optics.DOE(torch.rand(65, 65, generator=torch.Generator().manual_seed(0)) * 6))
-    asked = replace(
-        lens.query([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(65, 65)), kappa=1.2, cells_per_sample=1.0
-    )
+    asked = lens.query([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(65, 65))
+    asked = asked.sampled(kappa=1.2, cells_per_sample=1.0)
     with pytest.raises(ValueError, match=r"reference is not converged here: twice its sampling changes it by .*Use"):
         PROPAGATORS["reference", "quadrature"](asked)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ class Rings:
             [self.wavelength], distances=self.distance, pixel_pitch=self.pitch, shape=(self.size, self.size),
             integrate=False, dtype=torch.float64,
         )  # fmt: skip
-        return replace(asked, **changed)
+        return asked.sampled(**changed)
 
     @property
     def truth(self) -> oracles.RadialPupil:

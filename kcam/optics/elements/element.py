@@ -49,6 +49,7 @@ class Element(nn.Module):
     """
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric
+    even = True  # likewise in x and in y; what has no terms is
     knots: Sequence[float] | Tensor | None = ()
     focuses = True  # whether its vergence counts when the sensor is put in focus; a deliberate defocus must not
 
@@ -59,6 +60,7 @@ class Element(nn.Module):
         super().__init_subclass__(**arguments)
         if "terms" in vars(cls):
             cls.symmetric = vars(cls).get("symmetric", False)
+            cls.even = vars(cls).get("even", cls.symmetric)
             cls.knots = vars(cls).get("knots")
 
     def vergence(self, wavelengths: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ class ElementStack(nn.Module):
     @property
     def even(self) -> bool:
         """Whether no element's path tells x from -x and y from -y, by its type; maps of pixels may."""
-        return all(e.symmetric or getattr(e.terms, "__func__", None) is Element.terms for e in self.elements)
+        return all(element.even and "terms" not in vars(element) for element in self.elements)
 
     @property
     def round(self) -> bool:

@@ -31,8 +31,8 @@ def mtf(query: Query, *, propagator: str = "nonparaxial", method: str | None = N
         for dim, n in zip((-2, -1), query.shape, strict=True):
             modulation = modulation.narrow(dim, n * fine // 2 - n // 2, n)
             frequency = (torch.arange(n, device=modulation.device) - n // 2) / n  # cycles per pixel
-            if query.integrate:
-                sinc = torch.sinc(frequency * query.active).abs().to(modulation)
+            if query.grid.integrate:
+                sinc = torch.sinc(frequency * query.grid.active).abs().to(modulation)
                 modulation = modulation * (sinc[:, None] if dim == -2 else sinc)
         curves.append(modulation / total)
     return torch.stack(curves, dim=1)
@@ -53,13 +53,13 @@ def encircled_energy(query: Query, *, propagator: str = "nonparaxial", method: s
 
 def _points_per_pixel(query: Query, wavelength: Tensor) -> int:
     """Whole points per pixel that sample the irradiance, whether or not the query integrates over its pixels."""
-    return math.ceil(replace(query, integrate=True).evaluation_grid(float(wavelength))[0])
+    return math.ceil(query.on(integrate=True).evaluation_grid(float(wavelength))[0])
 
 
 def _between_pixels(query: Query, wavelength: Tensor, *, fine: int, shape: tuple[int, int]) -> Query:
     """The same question of one wavelength at points `fine` times as close, not integrated."""
-    pitch = query.pixel_pitch / fine
-    return replace(query, wavelengths=wavelength[None], pixel_pitch=pitch, shape=shape, integrate=False)
+    one = replace(query, wavelengths=wavelength[None])
+    return one.on(pitch=query.pixel_pitch / fine, shape=shape, integrate=False)
 
 
 def _disc_sum(image: Tensor, radius: int) -> Tensor:

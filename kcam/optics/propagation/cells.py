@@ -59,7 +59,7 @@ class Cells:
                 "spans the aperture, or give the aperture's size as a number."
             )
         maps = sizes(query, found)
-        widest = 2 / min(query.cells_per_sample * count, max(_MOST_CELLS, 2 * count)) if discs else math.inf
+        widest = 2 / min(query.how.cells_per_sample * count, max(_MOST_CELLS, 2 * count)) if discs else math.inf
         like: Any = {"dtype": query.dtype, "device": query.device}
         edges, _ = cell_edges(maps, widest)
 

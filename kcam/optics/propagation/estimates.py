@@ -18,6 +18,7 @@ from kcam.optics.propagation.question import Query, radial_phase, residual_path
 from kcam.optics.pupil.coordinates import from_image_side
 from kcam.optics.pupil.maps import map_response
 from kcam.optics.pupil.rim import FINE, edge_response
+from kcam.optics.source import Points
 
 _SIDE = 65  # of the grid on which rays are traced
 _NEAR = 1e-5  # of the semi-aperture: the step over which a slope is taken
@@ -58,7 +59,7 @@ def _trace(query: Query) -> list[Rays]:
         nearest = vergences[(vergences - power).abs().argmin()]
         vergences = torch.stack([vergences.min(), vergences.max(), nearest]).unique()
         side = torch.linspace(-1, 1, _SIDE, dtype=torch.float64, device=query.device)
-        exact = replace(query, wavelengths=wavelengths, vergences=vergences, paraxial=False)
+        exact = replace(query, wavelengths=wavelengths, points=Points(vergences), paraxial=False)
         flat = replace(exact, paraxial=True)
         x, y = side[None, :], side[:, None]
 
@@ -98,7 +99,7 @@ def grid_error(query: Query, rays: Rays, *, period: float) -> float:
     Args: period: at which the transform repeats, lambda d / spacing [m].
     """
     airy = rays.wavelength * float(query.sensor_distance.detach()) / (2 * float(query.semi_aperture.detach()))
-    edge = query.pixel_pitch * (max(query.shape) / 2 + (1 if query.integrate else 0))
+    edge = query.pixel_pitch * (max(query.shape) / 2 + (1 if query.grid.integrate else 0))
     r = (np.arange(_RADII) + 0.5) / _RADII * edge
     blur = max(math.sqrt(2) * rays.rms, airy / 2)
     light = np.where(r < blur, 1 / (math.pi * blur**2), 0.0)
@@ -158,7 +159,7 @@ def debye_error(query: Query, rays: Rays) -> float:
         aside = aside * np.minimum(1.0, aside + rays.phase)
     wrong = np.minimum(2.0, phase * r + r**2 / d**2 + aside)
     captured = min(1.0, 4 * math.pi * edge / _RADII * float((light * ring).sum()))
-    margin = min(1e-3, 8e-5 / captured) if query.integrate else 0.0
+    margin = min(1e-3, 8e-5 / captured) if query.grid.integrate else 0.0
     return margin + float((wrong * light * ring).sum() / (light * ring).sum())
 
 
@@ -226,7 +227,7 @@ def _map_error(query: Query, *, wavelength: float, period: float, captured: floa
     if discs:
         spacing = wavelength * float((query.sensor_distance / query.semi_aperture).detach()) / period
         pixel = min(2 * half_width / count for count, half_width in sizes(query, found))
-        per_pixel = math.ceil(pixel * query.cells_per_sample / spacing)
+        per_pixel = math.ceil(pixel * query.how.cells_per_sample / spacing)
         rim = sum(radius for radius, _ in discs) / sum(weight * radius**2 for radius, weight in discs)
         cut = 4e-4 * rim * {1: 3.0, 2: 1.6}.get(per_pixel, 1.0) / captured ** (1 / 3)
     r = (np.arange(_RADII) + 0.5) / _RADII

@@ -12,6 +12,7 @@ from kcam.optics.propagation.grid import sample_counts
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.propagation.table import PROPAGATORS, choose
+from kcam.optics.source import Points
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def explain(query: Query, *, propagator: str | Propagator = "nonparaxial", metho
     rays = trace(query)
     wavelengths = torch.tensor(sorted({ray.wavelength for ray in rays}), dtype=torch.float64)
     vergences = torch.tensor(sorted({ray.vergence for ray in rays}, reverse=True), dtype=torch.float64)
-    few = replace(query, wavelengths=wavelengths, vergences=vergences.to(query.device))
+    few = replace(query, wavelengths=wavelengths, points=Points(vergences.to(query.device)))
     with torch.no_grad():
         energy = chosen(few).sum((-2, -1)).cpu()
     samples = None

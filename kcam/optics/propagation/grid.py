@@ -40,7 +40,7 @@ def grid_psf(query: Query, *, method: str) -> Tensor:
 
 def samples_by_rule(query: Query, index: int) -> int:
     """Pupil samples for a wavelength of a query by the rule of `sampling.pupil_samples`, however many."""
-    needed = sampling.pupil_samples(**_geometry(query, index), kappa=query.kappa)
+    needed = sampling.pupil_samples(**_geometry(query, index), kappa=query.how.kappa)
     if query.has_pixel_phase:  # few distinct grids: each needs weights of its own for the map
         step = max(64, 2 ** (needed.bit_length() - 4))
         needed = step * math.ceil(needed / step)
@@ -49,7 +49,7 @@ def samples_by_rule(query: Query, index: int) -> int:
 
 def sample_counts(query: Query) -> list[int]:
     """Pupil samples for each wavelength, as given or by the rule, also where so many would be refused."""
-    return [query.samples or samples_by_rule(query, index) for index in range(len(query.wavelengths))]
+    return [query.how.samples or samples_by_rule(query, index) for index in range(len(query.wavelengths))]
 
 
 def _geometry(query: Query, index: int) -> dict[str, float]:
@@ -68,7 +68,7 @@ def _checked_samples(query: Query, index: int) -> int:
     Raises: ValueError with the sampling that would do.
     """
     geometry, needed = _geometry(query, index), samples_by_rule(query, index)
-    if query.samples is None:
+    if query.how.samples is None:
         if needed > sampling.MAX_PUPIL_SAMPLES:
             raise ValueError(
                 f"this PSF needs {needed} pupil samples at {geometry['wavelength'] * 1e9:.4g} nm (blur "
@@ -77,12 +77,12 @@ def _checked_samples(query: Query, index: int) -> int:
                 "propagator='geometric'."
             )
         return needed
-    if sampling.kappa_of(query.samples, **geometry) <= 1:
+    if sampling.kappa_of(query.how.samples, **geometry) <= 1:
         raise ValueError(
-            f"a pupil of {query.samples} samples is too coarse at {geometry['wavelength'] * 1e9:.4g} nm: its replicas "
-            f"would enter the window. Use samples >= {needed}, or leave samples out."
+            f"a pupil of {query.how.samples} samples is too coarse at {geometry['wavelength'] * 1e9:.4g} nm: its "
+            f"replicas would enter the window. Use samples >= {needed}, or leave samples out."
         )
-    return query.samples + query.samples % 2
+    return query.how.samples + query.how.samples % 2
 
 
 def _groups(query: Query, *, method: str) -> Iterator[tuple[list[int], int, float]]:
@@ -126,7 +126,7 @@ def _grid_group(query: Query, members: list[int], *, count: int, per_pixel: floa
     if curved:
         kernels = _curve(query, kernels, scales, nodes, step=step, reach=reach, like=like)
 
-    along = (nodes[count // 2 :] if query.lens.even else nodes).to(query.device)
+    along = (nodes[count // 2 :] if query.even else nodes).to(query.device)
     x, y = along[None, :], along[:, None]
     pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
     coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
@@ -135,7 +135,7 @@ def _grid_group(query: Query, members: list[int], *, count: int, per_pixel: floa
     cells = Cells.of(query, wavelengths, count=count, spacing=spacing)
     if cells is None:
         quadrant = _disc_weights(query, count=count, spacing=spacing)
-        weights, share = (quadrant, 4) if query.lens.even else (unfold(quadrant), 1)
+        weights, share = (quadrant, 4) if query.even else (unfold(quadrant), 1)
         energy = share * (weights * amplitude**2).sum((-2, -1)) * cell_area
         amplitude, field = weights * amplitude, None
     else:  # they hold the aperture, for its rim cuts their pixels
@@ -171,7 +171,7 @@ def _curve(
 
 
 def _curved(query: Query) -> bool:
-    return query.curved_kernel and query.lens.has_pixels and not query.paraxial
+    return query.how.curved_kernel and query.lens.has_pixels and not query.paraxial
 
 
 def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
@@ -185,7 +185,7 @@ def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
     semi_aperture, distance = query.scale
     if _curved(query):
         semi_aperture = float(query.semi_aperture.detach()) * mean_slope(float(query.tau.detach()))
-    shortest = max(math.ceil(2 * query.kappa * (query.half_window + displacement) / step), 2 * reach + 1)
+    shortest = max(math.ceil(2 * query.how.kappa * (query.half_window + displacement) / step), 2 * reach + 1)
     scale_step = 2 * math.pi * semi_aperture * step / (wavelength * distance)
     length = fast_length(shortest)
     if scale_step >= math.pi:
@@ -264,7 +264,7 @@ def _error(query: Query, *, method: str) -> float:
             _, length, _ = _fft_grid(query, index)
             period = length * query.pixel_pitch / query.evaluation_grid(rays.wavelength)[0]
         else:
-            count = query.samples or samples_by_rule(query, index)
+            count = query.how.samples or samples_by_rule(query, index)
             period = rays.wavelength * distance * (count - 2 * EDGE_MARGIN) / (2 * semi_aperture)
         rounding = ROUNDING[query.dtype] * (5 if method == "fft" else 1)
         error = grid_error(query, rays, period=period) + paraxial_error(rays, query)
@@ -297,7 +297,7 @@ def _fft_cost(query: Query) -> float:
 
 def _sizes(query: Query) -> Iterator[tuple[int, int]]:
     """(pupil samples, points) on each axis, for each wavelength."""
-    return zip(sample_counts(query), query.points, strict=True)
+    return zip(sample_counts(query), query.points_per_axis, strict=True)
 
 
 def _needs_fine_points(query: Query) -> str | None:
@@ -307,7 +307,7 @@ def _needs_fine_points(query: Query) -> str | None:
     """
     semi_aperture, distance = query.scale
     finest = float(query.wavelengths.min()) * distance / (2 * semi_aperture)
-    if query.integrate or query.pixel_pitch < 0.9 * finest:
+    if query.grid.integrate or query.pixel_pitch < 0.9 * finest:
         count = max((_fft_grid(query, index)[0] for index in range(len(query.wavelengths))), default=0)
         if count <= sampling.MAX_PUPIL_SAMPLES:
             return None

@@ -26,39 +26,91 @@ from kcam.optics.propagation.pixels import Pixels
 from kcam.optics.propagation.rings import Scatter, panels_of, scatter
 from kcam.optics.pupil.coordinates import Pupil, pupil_tau
 from kcam.optics.pupil.maps import pixel_under
+from kcam.optics.source import PixelGrid, Points
 
 _SPREAD = 1e-6  # share of the light that the structure of a radius may send beyond the displacement that is sampled
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How closely a query is answered; what it asks does not depend on it.
+
+    kappa: pupil samples per fringe, see `sampling.pupil_samples`. samples: across the pupil, instead.
+    cells_per_sample: of pixel maps, at least, for each pupil sample and axis: the rim cuts cells by their area.
+    curved_kernel: beyond the paraxial range leave flat pixels in the true pupil plane and curve the kernel, exact and
+        slow, instead of interpolating their field into the plane where the kernel is straight.
+    """
+
+    kappa: float = sampling.KAPPA
+    samples: int | None = None
+    cells_per_sample: float = 1.7
+    curved_kernel: bool = False
 
 
 @dataclass(frozen=True)
 class Query:
     """What is asked of a propagator: a lens, where the light comes from, and which pixels to fill.
 
-    wavelengths: (L,) float64 [m]; vergences: (Z,) float64 [1/m], 0 for infinity, may carry gradients.
-    pixel_pitch [m]; shape: (H, W) pixels; integrate: over pixels (else point samples times the pixel's area).
-    active: width of the light-sensitive part of a pixel (square root of the fill factor).
-    whole: scaled to what whole pixels receive together, see `Pixels`.
-    samples: across the pupil, or None for the rule of `sampling.pupil_samples` with `kappa`.
-    cells_per_sample: of pixel maps, at least, for each pupil sample and axis: the rim cuts cells by their area.
-    curved_kernel: beyond the paraxial range leave flat pixels in the true pupil plane and curve the kernel, exact and
-        slow, instead of interpolating their field into the plane where the kernel is straight.
+    wavelengths: (L,) float64 [m]. points: whose vergences are on the grid's device. grid: the pixels.
+    how: closely it is answered. paraxial: by the model of a row. whole: scaled to what whole pixels receive together,
+    see `Pixels`.
     """
 
     lens: ElementStack
     wavelengths: Tensor
-    vergences: Tensor
-    pixel_pitch: float
-    shape: tuple[int, int]
-    dtype: torch.dtype
-    device: torch.device
+    points: Points
+    grid: PixelGrid
+    how: Sampling = Sampling()
     paraxial: bool = False
-    integrate: bool = True
-    active: float = 1.0
     whole: bool = False
-    kappa: float = sampling.KAPPA
-    samples: int | None = None
-    cells_per_sample: float = 1.7
-    curved_kernel: bool = False
+
+    def on(self, **grid: Any) -> Query:
+        """The same question of other pixels; arguments: as of `PixelGrid`."""
+        return replace(self, grid=replace(self.grid, **grid))
+
+    def sampled(self, **how: Any) -> Query:
+        """The same question, answered more or less closely; arguments: as of `Sampling`."""
+        return replace(self, how=replace(self.how, **how))
+
+    @property
+    def vergences(self) -> Tensor:
+        """Of the points, (Z,) float64 [1/m]."""
+        return self.points.vergences
+
+    @property
+    def pixel_pitch(self) -> float:
+        """[m]."""
+        return self.grid.pitch
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W) pixels."""
+        return self.grid.shape
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the answer."""
+        return self.grid.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of the answer."""
+        return self.grid.device
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether what is asked is rotationally symmetric: the lens, and the points lie on its axis."""
+        return self.points.positions is None and self.lens.symmetric
+
+    @property
+    def has_rings(self) -> bool:
+        """Whether a rotationally symmetric path may have structure along the radius."""
+        return self.lens.has_rings
+
+    @property
+    def even(self) -> bool:
+        """Whether no path tells x from -x or y from -y; maps of pixels may."""
+        return self.points.positions is None and self.lens.even
 
     @property
     def semi_aperture(self) -> Tensor:
@@ -88,14 +140,14 @@ class Query:
     @property
     def half_pixels(self) -> int:
         """Pixels from the origin to the edge of what is evaluated."""
-        return max(self.shape) // 2 + (sampling.WINDOW_MARGIN if self.integrate else 0)
+        return max(self.shape) // 2 + (sampling.WINDOW_MARGIN if self.grid.integrate else 0)
 
     def evaluation_grid(self, wavelength: float) -> tuple[float, int]:
         """(points per pixel, points from the origin to the edge) at which the intensity of a wavelength is
         evaluated.
         """
         per_pixel = 1.0
-        if self.integrate:
+        if self.grid.integrate:
             semi_aperture, distance = self.scale
             per_pixel = sampling.points_per_pixel(
                 pixel_pitch=self.pixel_pitch,
@@ -106,7 +158,7 @@ class Query:
         return per_pixel, math.ceil(per_pixel * self.half_pixels)
 
     @property
-    def points(self) -> list[int]:
+    def points_per_axis(self) -> list[int]:
         """On each axis, at which the intensity of each wavelength is evaluated."""
         return [2 * self.evaluation_grid(wavelength)[1] + 1 for wavelength in self.wavelengths.tolist()]
 
@@ -142,7 +194,7 @@ class Query:
     @functools.cached_property
     def scatter(self) -> Scatter | None:
         """What the rings of the pupil scatter, at the outermost wavelengths and distances; None where it has none."""
-        if not self.lens.has_rings:
+        if not self.has_rings:
             return None
         with torch.no_grad():
             return scatter(self.panels, radial_phase(self))
@@ -179,7 +231,7 @@ class Query:
 
     def pixels(self, per_pixel: float) -> Pixels:
         """The pixels that are asked for, over so many points each."""
-        return Pixels(self.shape, per_pixel, active=self.active, integrate=self.integrate, whole=self.whole)
+        return Pixels(self.shape, per_pixel, active=self.grid.active, integrate=self.grid.integrate, whole=self.whole)
 
     def pupil(self, x: Tensor, y: Tensor) -> Pupil:
         """The pupil at true normalised coordinates."""
@@ -225,7 +277,8 @@ def _outermost(query: Query) -> Query:
     """The shortest and longest wavelength, the nearest and farthest distance; |grad W| is convex in the vergence."""
     wavelengths = torch.stack([query.wavelengths.min(), query.wavelengths.max()]).unique()
     vergences = query.vergences.detach()
-    return replace(query, wavelengths=wavelengths, vergences=torch.stack([vergences.min(), vergences.max()]).unique())
+    ends = torch.stack([vergences.min(), vergences.max()]).unique()
+    return replace(query, wavelengths=wavelengths, points=Points(ends))
 
 
 def radial_phase(query: Query) -> Callable[[Tensor], Tensor]:
@@ -275,7 +328,7 @@ def _ray_displacement(query: Query, share: float) -> Tensor:
     lens, outermost = query.lens, replace(_outermost(query), wavelengths=query.wavelengths)
     with torch.no_grad():
         side = torch.linspace(-1, 1, 97, dtype=torch.float64, device=query.device)
-        if lens.symmetric:
+        if query.symmetric:
             side = side[48:]
             x, y = side, torch.zeros_like(side)
         else:

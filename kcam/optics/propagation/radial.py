@@ -130,11 +130,11 @@ def _error(query: Query) -> float:
 
 def lookup_cost(query: Query) -> float:
     """Operations of 40 for each point at which the intensity is evaluated."""
-    return query.vergences.numel() * sum(40.0 * m * m for m in query.points)
+    return query.vergences.numel() * sum(40.0 * m * m for m in query.points_per_axis)
 
 
 def _needs_symmetry(query: Query) -> str | None:
-    if query.lens.symmetric:
+    if query.symmetric:
         return None
     names = sorted({type(element).__name__ for element in query.lens.elements if not element.symmetric})
     return f"needs a lens of rotationally symmetric elements, but has {', '.join(names)}; use method='matrix'."

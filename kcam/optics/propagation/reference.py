@@ -16,8 +16,9 @@ from torch import Tensor
 
 from kcam.optics.propagation.grid import grid_psf, matrix_cost
 from kcam.optics.propagation.polar import polar_psf
-from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.question import Query, Sampling
 from kcam.optics.propagation.row import PRODUCTS, Propagator
+from kcam.optics.source import Points
 
 _KAPPA = 4.5
 _CELLS_PER_SAMPLE = 6.8
@@ -70,20 +71,16 @@ def checked_psf(query: Query, answer: Tensor | None = None) -> tuple[Tensor, Con
 
 
 def _refined(query: Query) -> Query:
-    return replace(
-        query,
-        dtype=torch.float64,
-        kappa=max(query.kappa, _KAPPA),
-        samples=None,
-        curved_kernel=True,
-        cells_per_sample=max(query.cells_per_sample, _CELLS_PER_SAMPLE),
-    )
+    cells = max(query.how.cells_per_sample, _CELLS_PER_SAMPLE)
+    how = Sampling(max(query.how.kappa, _KAPPA), cells_per_sample=cells, curved_kernel=True)
+    return replace(query.on(dtype=torch.float64), how=how)
 
 
 def _evaluate(query: Query, *, doubling: int) -> Tensor:
     if query.lens.round and not query.lens.has_pixels:
         return polar_psf(query, density=doubling)
-    query = replace(query, kappa=doubling * query.kappa, cells_per_sample=doubling * query.cells_per_sample)
+    how = query.how
+    query = query.sampled(kappa=doubling * how.kappa, cells_per_sample=doubling * how.cells_per_sample)
     return grid_psf(query, method="matrix")
 
 
@@ -91,14 +88,10 @@ def convergence(query: Query) -> Convergence:
     """Measure the reference at the shortest wavelength of a query, at 9 x 9 points spread over its window."""
     with torch.no_grad():
         half = max(query.half_pixels, 1)
-        spots = replace(
-            _refined(query),
-            wavelengths=query.wavelengths.min()[None],
-            vergences=query.vergences.detach(),
-            pixel_pitch=query.pixel_pitch * half / (_SPOTS // 2),
-            shape=(_SPOTS, _SPOTS),
-            integrate=False,
-        )
+        pitch = query.pixel_pitch * half / (_SPOTS // 2)
+        refined = _refined(query).on(pitch=pitch, shape=(_SPOTS, _SPOTS), integrate=False)
+        points = replace(query.points, vergences=query.vergences.detach())
+        spots = replace(refined, wavelengths=query.wavelengths.min()[None], points=points)
         own, doubled = _evaluate(spots, doubling=1), _evaluate(spots, doubling=2)
         difference = float(((own - doubled).abs().mean((-2, -1)) / doubled.mean((-2, -1))).max())
         return Convergence(difference, _closed_form_error(spots), _limit(query))
@@ -113,7 +106,7 @@ def _closed_form_error(spots: Query) -> float:
     a, d = float(spots.semi_aperture.detach()), float(spots.sensor_distance.detach())
     focused = spots.vergences.new_full((1,), -1 / d)
     alone = spots.lens.aperture_alone(pixels=101 if spots.lens.has_pixel_phase else None)
-    bare = replace(spots, lens=alone, paraxial=True, vergences=focused)
+    bare = replace(spots, lens=alone, paraxial=True, points=Points(focused))
     points = (np.arange(_SPOTS) - _SPOTS // 2) * spots.pixel_pitch
     frequency = points / (float(spots.wavelengths[0]) * d)  # cycles per metre of pupil
     discs = spots.lens.aperture.discs()

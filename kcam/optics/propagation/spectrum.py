@@ -50,12 +50,12 @@ def spectrum_grids(query: Query) -> list[tuple[int, float]]:
         count = fast_length(math.ceil(width * 2.2 * steepest))
         count += count % 2
         pitch = 1 / (2.2 * steepest)
-        if query.samples is not None:
-            count, pitch = query.samples + query.samples % 2, width / query.samples
+        if query.how.samples is not None:
+            count, pitch = query.how.samples + query.how.samples % 2, width / query.how.samples
             if pitch > 1 / (2 * a / math.hypot(a, d) / wavelength):
                 raise ValueError(
-                    f"{query.samples} samples are too coarse for angular_spectrum at {wavelength * 1e9:.4g} nm: the "
-                    f"wave that converges from the rim would alias. Use samples >= {math.ceil(width * 2 * steepest)}."
+                    f"{query.how.samples} samples are too coarse for angular_spectrum at {wavelength * 1e9:.4g} nm: "
+                    f"the wave converging from the rim would alias. Use samples >= {math.ceil(width * 2 * steepest)}."
                 )
         grids.append((count, pitch))
     return grids
@@ -117,12 +117,12 @@ def _error(query: Query) -> float:
 
     White noise of 6 radians is then off by 0.3, a square rim by 1e-2; rings that scatter beyond its grid by 3e-3.
     """
-    rim, rings = 0.0 if query.lens.round else 7e-3, 2e-3 if query.lens.has_rings else 0.0
+    rim, rings = 0.0 if query.lens.round else 7e-3, 2e-3 if query.has_rings else 0.0
     return 1e-3 + rim + rings + 0.12 * jumps(query)
 
 
 def _cost(query: Query) -> float:
-    query = replace(query, samples=None)  # a cost is no refusal
+    query = query.sampled(samples=None)  # a cost is no refusal
     total = sum(FFT_SLOWNESS * 10 * n**2 * math.log2(n) for n, _ in spectrum_grids(query))
     return query.vergences.numel() * total
 
