@@ -145,7 +145,7 @@ class Lens(ElementStack):
         """The arguments of `psf`, checked, as one value."""
         if device is None:
             device = next((t.device for t in (*self.parameters(), *self.buffers())), torch.device("cpu"))
-        pixels = PixelGrid(pixel_pitch, shape, fill_factor, integrate, dtype, device)
+        pixels = PixelGrid(check_pixel_pitch(pixel_pitch), shape, fill_factor, integrate, dtype, device)
         grid = check_distances(distances)
         if grid.ndim > 1 or grid.numel() == 0:
             raise ValueError(
@@ -180,6 +180,7 @@ class Lens(ElementStack):
     def question(self, points: Points, wavelengths: Tensor, pixels: PixelGrid, recipe: Recipe = _DEFAULT) -> Query:
         """What `bank` asks of a propagator."""
         check_distances(1 / points.vergences.detach())
+        check_pixel_pitch(pixels.pitch)
         return self._question(points, wavelengths, pixels, recipe)
 
     def _question(self, points: Points, wavelengths: Tensor | list[float], pixels: PixelGrid, recipe: Recipe) -> Query:
@@ -193,7 +194,6 @@ class Lens(ElementStack):
             )
         if points.positions is not None:
             raise ValueError("thin elements have one PSF, that on the axis: leave out the positions on the sensor.")
-        check_pixel_pitch(pixels.pitch)
         self.check()
         self._check_f_number()
         points = Points(points.vergences.to(pixels.device, torch.float64))
