@@ -18,7 +18,7 @@ import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
 
-from kcam.augmentation.draws import Draw, Draws
+from kcam.augmentation.distributions import Draw, Draws
 from kcam.inputs import ALPHA, as_map, as_values, channels_last, check_floats, remedy, scale_remedy
 from kcam.isp import tone_curve
 from kcam.precision import full_precision

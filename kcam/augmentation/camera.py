@@ -13,11 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, wavelengths_of
-from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
+from kcam.augmentation.distributions import Bounds, Choice, Draw, Seed, Uniform
 from kcam.augmentation.optics import LEAST_VERGENCE, finite_vergence
 from kcam.cache import Settings
 from kcam.camera import PRESETS, Camera
-from kcam.planner.making import check_tolerance
+from kcam.planner.planner import check_tolerance
 from kcam.scene import Scene
 from kcam.ste import clip_ste
 from kcam.units import wavelength_grid

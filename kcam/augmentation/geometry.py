@@ -15,7 +15,7 @@ from kornia.geometry.transform import remap
 from torch import Tensor
 
 from kcam.augmentation.base import Checked, check_probability, drawn_rows
-from kcam.augmentation.draws import Bounds, Draws, Uniform
+from kcam.augmentation.distributions import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
 _ITERATIONS = 40  # of the inverse, a fixed point, at most

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kcam.augmentation.base import CameraAugmentation, wavelengths_of
-from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
+from kcam.augmentation.distributions import Bounds, Draw, Normal, Uniform
 from kcam.isp import apply_colour_matrix, render_tones
 from kcam.isp.colour import CONTRASTS, GAMMAS
 from kcam.units import nm, wavelength_grid

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam.augmentation.base import CameraAugmentation, check_inverse_depth, per_sample, wavelengths_of
-from kcam.augmentation.draws import Bounds, Draw, Normal, Uniform
+from kcam.augmentation.distributions import Bounds, Draw, Normal, Uniform
 from kcam.compiled import uncompiled
 from kcam.optics import batch_psf, refractive_index
 from kcam.optics.rendering.convolution import Convolution

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, per_sample
-from kcam.augmentation.draws import Bounds, Choice, Draw, Seed, Uniform
+from kcam.augmentation.distributions import Bounds, Choice, Draw, Seed, Uniform
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.isp import ColourMatrix, Demosaic, ToneCurve, WhiteBalance, demosaic

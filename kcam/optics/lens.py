@@ -14,7 +14,7 @@ from torch import Tensor
 from kcam.optics.accuracy import Recipe
 from kcam.optics.elements.stack import ElementStack
 from kcam.optics.propagation.analysis import encircled_energy, mtf
-from kcam.optics.propagation.explain import Explanation, explain
+from kcam.optics.propagation.explanation import Explanation, explain_query
 from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query, Sampling, residual_vergence
 from kcam.optics.propagation.sampling import KAPPA, MAX_PUPIL_SAMPLES
@@ -116,7 +116,7 @@ class Lens(ElementStack):
             more than 3 times too small, down to 1e-6, over random cameras. The captured energy is computed.
         """
         query, how = self._asked(wavelengths, **arguments)
-        return explain(query, **how)
+        return explain_query(query, **how)
 
     def _asked(
         self,

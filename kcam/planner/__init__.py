@@ -1,6 +1,5 @@
 """The planner: simulate only the effects that a scene calls for, inside a tolerance, and say what was left out."""
 
-from kcam.planner.making import Planner, explain, make_plan, measured, timed
 from kcam.planner.plan import (
     Decision,
     OutOfRange,
@@ -11,6 +10,7 @@ from kcam.planner.plan import (
     relative_rms,
     with_imaging,
 )
+from kcam.planner.planner import Planner, explain, make_plan, measured, timed
 
 __all__ = [
     "Decision",

@@ -15,7 +15,7 @@ import torch
 from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
-from kcam.planner.trials import Trials
+from kcam.planner.evaluation import Evaluator
 from kcam.scene import Scene
 
 FEW_BANDS, FEW_LAYERS, TAIL = 3, 3, 16
@@ -78,7 +78,7 @@ class Ladder:
     def _key(self, position: int) -> tuple[int, int]:
         return position, self.follows.position if self.follows else 0
 
-    def price(self, trials: Trials) -> None:
+    def price(self, evaluator: Evaluator) -> None:
         """Estimate the error of the rung that it stands on."""
         key = self._key(self.position)
         if self.at_top or key in self.errors:
@@ -89,7 +89,7 @@ class Ladder:
         beside = self.beside | (self.follows.level.changes if self.follows else {})
         upper = self.levels[self.position + 1] if self.successive else self.levels[-1]
         candidates = [self.level] + (self.alternatives(self.level) if self.alternatives else [])
-        errors = [trials.error(beside | level.changes, beside | upper.changes) for level in candidates]
+        errors = [evaluator.error(beside | level.changes, beside | upper.changes) for level in candidates]
         best = min(range(len(errors)), key=errors.__getitem__)
         self.levels[self.position] = candidates[best]
         error = errors[best]
@@ -97,10 +97,10 @@ class Ladder:
             error /= 1 - (self.level.fineness / upper.fineness) ** ORDER
         self.errors[key] = error
 
-    def climb(self, trials: Trials) -> None:
+    def climb(self, evaluator: Evaluator) -> None:
         """One rung up, and its error."""
         self.position += 1
-        self.price(trials)
+        self.price(evaluator)
 
     def why(self) -> str:
         """The number that decided."""
@@ -110,19 +110,19 @@ class Ladder:
         return f"{self.levels[self.position - 1].label} would cost {self.errors[below]:.2g}"
 
 
-def ladders(trials: Trials, scene: Scene) -> list[Ladder]:
+def ladders(evaluator: Evaluator, scene: Scene) -> list[Ladder]:
     """The choices that exist for a camera and a scene (the one that takes longest)."""
-    imaging = trials.imaging
+    imaging = evaluator.imaging
     if imaging is None:
         return []
-    view = _View(trials, imaging, scene)
+    view = _View(evaluator, imaging, scene)
     return [ladder for make in LADDERS for ladder in make(view)]
 
 
 class _View:
     """What the ladders look at."""
 
-    def __init__(self, trials: Trials, imaging: Imaging, scene: Scene) -> None:
+    def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene) -> None:
         self.imaging, self.scene = imaging, scene
         planes = imaging.working(scene)
         self.vergences, _ = imaging.layers_of(scene, planes)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from kcam.inputs import check_picture
 from kcam.ste import clip_ste
-from kcam.style.draws import torch_generator
+from kcam.style.generators import torch_generator
 from kcam.style.losses import StyleLoss
 from kcam.threads import no_more_than_free
 

@@ -20,7 +20,7 @@ from kcam.isp.style_stage import LEAST_SHOWN
 from kcam.plain import fitting
 from kcam.planner import Plan
 from kcam.style.checkpoints import Checkpoints
-from kcam.style.draws import torch_generator
+from kcam.style.generators import torch_generator
 from kcam.style.losses import StyleLoss, luminance
 from kcam.style.optimiser import load_optimiser_state, optimiser_state
 from kcam.style.processes import place, start_alike, told_by_the_first

@@ -13,7 +13,7 @@ import torch
 from kcam import spectral
 from kcam.data import PatchDataset
 from kcam.scene import PHOTOGRAPHS, Scene
-from kcam.style.draws import philox
+from kcam.style.generators import philox
 
 SCALES = (2.0, 1.0, 0.7, 0.4)
 """Of the built-in photographs: strokes are as wide whatever the scale of what they show."""

@@ -20,7 +20,7 @@ from benchmarks.planner import LATER, TOLERANCES, hard_pair, later_scene, random
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.effects import Work
 from kcam.optics.propagation.row import Propagator
-from kcam.planner import OutOfRange, Plan, Planner, costs, noiseless_raw, relative_rms, trials
+from kcam.planner import OutOfRange, Plan, Planner, costs, evaluation, noiseless_raw, relative_rms
 from kcam.planner.ladders import even_counts
 from kcam.planner.plan import with_imaging
 from kcam.units import mm, um, wavelength_grid
@@ -123,7 +123,7 @@ def test_large_scenes_are_planned_on_crops() -> None:
         planner = Planner(camera(diameter=1.5 * mm), light)
         plan = planner.plan(0.03)
         assert plan.measure(camera(diameter=1.5 * mm), light) <= 0.03
-    assert sum(math.prod(sample.scene.shape[1:]) for sample in planner.trials.samples) < 400 * 400 / 2
+    assert sum(math.prod(sample.scene.shape[1:]) for sample in planner.evaluator.samples) < 400 * 400 / 2
 
 
 def item_of(scene: Scene, row: int) -> Scene:
@@ -187,8 +187,8 @@ def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
 ) -> None:
     """One item in light of one wavelength, of less contrast than the others, and another one that is nearer; not all
     can be tried."""
-    monkeypatch.setattr(trials, "LARGEST", 48**2)
-    monkeypatch.setattr(trials, "WITNESSED", 4 * 48**2)
+    monkeypatch.setattr(evaluation, "LARGEST", 48**2)
+    monkeypatch.setattr(evaluation, "WITNESSED", 4 * 48**2)
     draw, grid = random.Random(seed), wavelength_grid()
     count, line = 8, draw.choice([1, 2, 3, 5, 8, 25])
     coloured, near = draw.sample(range(count), 2)
@@ -203,7 +203,7 @@ def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
     depth[near] = 0.9
     light, shot = Scene(planes, spectra, grid, depth), camera(diameter=5 * mm)
     with torch.no_grad():
-        owners = {owner for sample in Planner(shot, light).trials.witnesses for owner in sample.owners}
+        owners = {owner for sample in Planner(shot, light).evaluator.witnesses for owner in sample.owners}
     assert {coloured, near} <= owners
     assert len(owners) < count
     assert_inside(shot, light, (0.05, 0.02, 0.005))
@@ -214,16 +214,16 @@ def test_crops_stand_for_a_picture_whose_last_trial_cannot_see_it_whole(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As with pictures of many megapixels: all that is tried is a few crops of the scene."""
-    monkeypatch.setattr(trials, "LARGEST", 64**2)
-    monkeypatch.setattr(trials, "CROP", 32)
-    monkeypatch.setattr(trials, "WITNESSED", 100**2)
+    monkeypatch.setattr(evaluation, "LARGEST", 64**2)
+    monkeypatch.setattr(evaluation, "CROP", 32)
+    monkeypatch.setattr(evaluation, "WITNESSED", 100**2)
     draw = random.Random(seed)
     light = dataclasses.replace(scene(256), coefficients=0.3 * scene(256).coefficients)
     place = draw.randrange(20, 236), draw.randrange(20, 236)
     light = with_lamp(light, at=place, radius=4, distance=1.2, gain=20)
     shot = thin()
     assert_inside(shot, light, (0.03,))
-    tried = Planner(shot, light).trials
+    tried = Planner(shot, light).evaluator
     for samples in (tried.samples, tried.witnesses):
         assert sum(math.prod(sample.scene.shape) for sample in samples) < 256**2
 
@@ -245,8 +245,8 @@ def test_one_near_item_among_far_ones_is_seen() -> None:
 
 def test_of_many_items_the_worst_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not every second or third: those that stand out, and the ends of the depth that the layers divide."""
-    monkeypatch.setattr(trials, "LARGEST", 4 * 32**2)
-    monkeypatch.setattr(trials, "WITNESSED", 4 * 32**2)
+    monkeypatch.setattr(evaluation, "LARGEST", 4 * 32**2)
+    monkeypatch.setattr(evaluation, "WITNESSED", 4 * 32**2)
     depth = torch.full((16, 1, 32, 32), 2.0, dtype=torch.float64)
     depth[5], depth[9] = 0.8, 2.5
     planes = scene(32).coefficients.repeat(16, 1, 1, 1)
@@ -254,7 +254,7 @@ def test_of_many_items_the_worst_are_tried(monkeypatch: pytest.MonkeyPatch) -> N
     light = dataclasses.replace(scene(32), coefficients=planes, depth=depth)
     with torch.no_grad():
         planner = Planner(thin(), light)
-    for samples in (planner.trials.samples, planner.trials.witnesses):
+    for samples in (planner.evaluator.samples, planner.evaluator.witnesses):
         assert {5, 9, 12} <= set(samples[0].owners)
         assert len(samples[0].owners) < 16
     assert_inside(thin(), light, (0.03,))
@@ -339,9 +339,7 @@ def test_nothing_is_free() -> None:
         costs.seconds(Work({"touch": 1.0, "juggling": 3.0}), costs.RATES)
     with pytest.raises(ValueError, match=r"my own/of an unknown name states a cost of 0 operations.*Give cost="):
         camera(propagator=own_row(0.0))[0].work(scene())
-    with pytest.raises(
-        ValueError, match=r"rate must be > 0 seconds for an operation of my own/.*, got 0"
-    ):
+    with pytest.raises(ValueError, match=r"rate must be > 0 seconds for an operation of my own/.*, got 0"):
         own_row(rate=0.0)
 
 

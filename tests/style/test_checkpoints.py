@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from kcam.style import checkpoints
 from kcam.style.checkpoints import Checkpoint, Checkpoints
-from kcam.style.draws import philox
+from kcam.style.generators import philox
 from kcam.style.optimiser import load_optimiser_state, optimiser_state
 
 

@@ -70,7 +70,7 @@ class Answer:
     gradients: tuple[Tensor, ...]
 
 
-class Trials:
+class Evaluator:
     """A camera's noiseless raw of some samples under changes of its Imaging, each computed once.
 
     Gradients are wanted where autograd is on and a parameter of the raw's stages requires them: then an error is the

@@ -16,9 +16,9 @@ from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Work
 from kcam.planner import costs
+from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
 from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw, with_imaging
-from kcam.planner.trials import Trials
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
@@ -47,8 +47,8 @@ def make_plan(
 
     A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
     until the sum of all errors is below the tolerance / `SAFETY`, and on until the last trial is: the whole plan
-    against the reference, each item of each batch by itself. Beyond `trials.WITNESSED` pixels it sees only the worst of
-    them. The way up does not depend on the tolerance: with a smaller one it goes further.
+    against the reference, each item of each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the
+    worst of them. The way up does not depend on the tolerance: with a smaller one it goes further.
 
     Args:      scenes: one or several, of the same wavelengths.
                tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this
@@ -72,9 +72,9 @@ class Planner:
         self.camera = camera
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         _check_scenes(self.scenes, max_memory)
-        self.trials = Trials(camera, self.scenes)
+        self.evaluator = Evaluator(camera, self.scenes)
         always = {} if max_memory is None else {"max_memory": float(max_memory)}
-        self.prices = _Prices(camera, self.trials, self.scenes, always)
+        self.prices = _Prices(camera, self.evaluator, self.scenes, always)
         self._checked: dict[tuple[Any, ...], float] = {}
         self._known: tuple[list[Ladder], list[_Skip], Signals] | None = None
         self._setup = time.perf_counter() - start
@@ -86,9 +86,9 @@ class Planner:
         rows = _Rows(self.prices)
         skipped: list[int] = []
         allowed = checked = 0.0
-        if tolerance != 0 and self.trials.samples:
+        if tolerance != 0 and self.evaluator.samples:
             ladders, skips, signals = self._ways()
-            noise = self.trials.noise(signals)
+            noise = self.evaluator.noise(signals)
             allowed = noise if isinstance(tolerance, str) else float(tolerance)
             if allowed == 0:  # a sensor without noise or steps records everything
                 ladders, skips = [], []
@@ -116,10 +116,12 @@ class Planner:
             changes=rows.changes,
             skipped=tuple(skipped),
             stages=tuple(type(stage).__name__ for stage in self.camera),
-            range=Range.of(self.scenes, [one for found in self.trials.surveys for one in found], self.trials.defocus),
-            gradients=self.trials.gradients,
+            range=Range.of(
+                self.scenes, [one for found in self.evaluator.surveys for one in found], self.evaluator.defocus
+            ),
+            gradients=self.evaluator.gradients,
             trained=tuple(name for name, p in self.camera.named_parameters() if p.requires_grad)
-            if self.trials.gradients
+            if self.evaluator.gradients
             else (),
             seconds=rows.spent[0],
             memory=rows.spent[1],
@@ -132,7 +134,7 @@ class Planner:
         """Climb until the estimates fit, and on until the last trial does; gives the error that it found."""
         counted = [skip for skip in skips if skip.counted]
         while True:
-            _climb(steps, counted, self.trials, allowed / SAFETY)
+            _climb(steps, counted, self.evaluator, allowed / SAFETY)
             ways: list[Any] = [*_relevant(steps), *counted]
             below = [way for way in ways if not way.at_top]
             if not below:
@@ -141,17 +143,17 @@ class Planner:
             skipped = tuple(_skipped(skips, allowed, noise))
             key = tuple(sorted(changes.items())), skipped
             if key not in self._checked:
-                self._checked[key] = self.trials.last(changes, skipped)
+                self._checked[key] = self.evaluator.last(changes, skipped)
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
-            max(below, key=lambda way: way.error).climb(self.trials)
+            max(below, key=lambda way: way.error).climb(self.evaluator)
 
     def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
         """All choices, and what the stages of the sensor are given."""
         if self._known is None:
-            steps = [ladder for ladder in ladders(self.trials, self.prices.scene) if self.prices.saves(ladder)]
-            signals = self.trials.signals(dict(steps[0].beside) if steps else {})
-            skips = [_Skip(self.camera, index, signals) for index in self.trials.skippable()]
+            steps = [ladder for ladder in ladders(self.evaluator, self.prices.scene) if self.prices.saves(ladder)]
+            signals = self.evaluator.signals(dict(steps[0].beside) if steps else {})
+            skips = [_Skip(self.camera, index, signals) for index in self.evaluator.skippable()]
             self._known = steps, skips, signals
         return self._known
 
@@ -213,16 +215,16 @@ def _relevant(steps: Sequence[Ladder]) -> list[Ladder]:
     return [ladder for ladder in steps if not (sharp and ladder.blurs)]
 
 
-def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], trials: Trials, most: float) -> None:
+def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator, most: float) -> None:
     """One rung at a time, on the ladder with the largest error, until their sum fits."""
     movable: list[Any] = [skip for skip in skips if skip.counted]
     while True:
         relevant: list[Any] = [*_relevant(steps), *movable]
         for ladder in relevant:
-            ladder.price(trials)
+            ladder.price(evaluator)
         if sum(ladder.error for ladder in relevant) <= most:
             return
-        max(relevant, key=lambda ladder: ladder.error).climb(trials)
+        max(relevant, key=lambda ladder: ladder.error).climb(evaluator)
 
 
 class _Skip:
@@ -248,10 +250,10 @@ class _Skip:
         """Whether it is kept."""
         return self.position == 1
 
-    def price(self, trials: Trials) -> None:
+    def price(self, evaluator: Evaluator) -> None:
         """It is known."""
 
-    def climb(self, trials: Trials) -> None:
+    def climb(self, evaluator: Evaluator) -> None:
         """Keep the stage."""
         self.position = 1
 
@@ -273,8 +275,8 @@ def _skipped(skips: Sequence[_Skip], allowed: float, noise: float | None) -> lis
 class _Prices:
     """Predicted time and memory of the raw of the scene that takes longest."""
 
-    def __init__(self, camera: Camera, trials: Trials, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
-        self.imaging, self.always = trials.imaging, always
+    def __init__(self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
+        self.imaging, self.always = evaluator.imaging, always
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}

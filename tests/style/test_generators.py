@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from kcam.style.draws import philox, torch_generator
+from kcam.style.generators import philox, torch_generator
 
 COUNT = 4096
 BOUND = 5 / COUNT**0.5  # 5 sigma of the correlation of two independent sequences of that length

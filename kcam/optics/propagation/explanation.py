@@ -88,7 +88,9 @@ def _short(reason: str) -> str:
     return first if len(first) <= 68 else first[:67] + "\u2026"
 
 
-def explain(query: Query, *, propagator: str | Propagator = "nonparaxial", method: str | None = None) -> Explanation:
+def explain_query(
+    query: Query, *, propagator: str | Propagator = "nonparaxial", method: str | None = None
+) -> Explanation:
     """Choose the row for a query and say what is to be expected of it; computes few PSFs, for the captured energy.
 
     Raises: ValueError as `choose`, and as the row itself where it cannot answer.
