@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam import files, isp, optics, sensor
-from kcam.context import Context, Stage
+from kcam.context import Context, Stage, applied
 from kcam.inputs import band_remedy, check_bands, describe
 from kcam.scene import Scene
 from kcam.threads import no_more_than_free
@@ -120,6 +120,13 @@ class Camera(nn.Module):
 
         An Imaging that absorbs the filter after it is one step, "Imaging + ColourFilter". Arguments: as `forward`.
         """
+        for _, name, signal in self.walk(scene, generator=generator):
+            yield name, signal
+
+    def walk(
+        self, scene: Scene | Tensor, *, generator: torch.Generator | None = None
+    ) -> Iterator[tuple[int, str, Tensor]]:
+        """As `steps`, with the number of stages that are behind each signal."""
         if not isinstance(scene, (Scene, Tensor)):
             if isinstance(scene, (list, tuple)) and any(isinstance(one, Scene) for one in scene):
                 raise TypeError(
@@ -139,18 +146,18 @@ class Camera(nn.Module):
         if isinstance(scene, Tensor) and len(self) and isinstance(self[0], (optics.Imaging, sensor.ColourFilter)):
             check_bands(scene, name="image", count=len(context.wavelengths), ndims=(4,), sure=False)
         signal: Any = scene
-        stages = pairwise([*self, None])
-        for stage, successor in stages:
+        stages = enumerate(pairwise([*self, None]), start=1)
+        for count, (stage, successor) in stages:
             name = type(stage).__name__
             if isinstance(stage, optics.Imaging) and isinstance(successor, sensor.ColourFilter):
                 name = f"{name} + {type(successor).__name__}"
-                signal = stage(signal, context, colour_filter=successor)
-                next(stages)
+                signal = applied(stage, signal, context, colour_filter=successor)
+                count, _ = next(stages)
             else:
                 if isinstance(signal, Scene) and not isinstance(stage, optics.Imaging):
                     signal = signal.bands()
-                signal = stage(signal, context) if isinstance(stage, Stage) else stage(signal)
-            yield name, signal
+                signal = applied(stage, signal, context)
+            yield count, name, signal
 
     def raw(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
         """What the sensor recorded: the signal just before the demosaic. Arguments: as `forward`.

@@ -96,6 +96,11 @@ def arguments_text(module: nn.Module) -> str:
     return ", ".join(shown)
 
 
+def applied(stage: nn.Module, signal: Any, context: Context, **others: Any) -> Any:
+    """What a module makes of a signal: a stage is told its context, any other module is not."""
+    return stage(signal, context, **others) if isinstance(stage, Stage) else stage(signal)
+
+
 class Stage(nn.Module):
     """A module from tensor to tensor that may read a `Context`: ``stage(signal)`` or ``stage(signal, context)``."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -26,6 +27,17 @@ FOCAL_LENGTH_RANGE = (1e-4, 10.0)
 _PLANES_IN_CACHE = 4  # that are convolved at once
 
 
+class BlurOptions(TypedDict, total=False):
+    """What every augmentation by PSFs takes beside its own arguments: see `RandomBlur`."""
+
+    pixel_pitch: float
+    outside: float
+    wavelengths: Tensor | list[float] | None
+    same_on_batch: bool
+    p: float
+    keepdim: bool
+
+
 class RandomBlur(CameraAugmentation):
     """Base of the augmentations that convolve each sample with PSFs of its own: a round thin lens, drawn per sample.
 
@@ -40,12 +52,12 @@ class RandomBlur(CameraAugmentation):
         self,
         draws: dict[str, Draw],
         *,
-        pixel_pitch: float,
-        outside: float,
-        wavelengths: Tensor | list[float] | None,
-        same_on_batch: bool,
-        p: float,
-        keepdim: bool,
+        pixel_pitch: float = PIXEL_PITCH,
+        outside: float = 0.01,
+        wavelengths: Tensor | list[float] | None = None,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
     ) -> None:
         super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
         if not 1e-4 <= outside < 1:
@@ -136,13 +148,8 @@ class RandomDefocus(RandomBlur):
         *,
         distance: Bounds = (0.5, 5.0),
         focal_length: Bounds = FOCAL_LENGTH,
-        pixel_pitch: float = PIXEL_PITCH,
         layers: int = 8,
-        outside: float = 0.01,
-        wavelengths: Tensor | list[float] | None = None,
-        same_on_batch: bool = False,
-        p: float = 0.5,
-        keepdim: bool = False,
+        **options: Unpack[BlurOptions],
     ) -> None:
         draws: dict[str, Draw] = {
             "focus": Uniform(focus, "vergence", least=1e-3, unit="[m]"),
@@ -150,15 +157,7 @@ class RandomDefocus(RandomBlur):
             "distance": Uniform(distance, "vergence", least=1e-3, unit="[m]"),
             "focal_length": Uniform(focal_length, least=1e-4, most=10.0, unit="[m]"),
         }
-        super().__init__(
-            draws,
-            pixel_pitch=pixel_pitch,
-            outside=outside,
-            wavelengths=wavelengths,
-            same_on_batch=same_on_batch,
-            p=p,
-            keepdim=keepdim,
-        )
+        super().__init__(draws, **options)
         nearest, longest = self.bounds("focus")[0], self.bounds("focal_length")[1]
         if nearest <= longest:
             raise ValueError(
@@ -251,27 +250,9 @@ class FocusedBlur(RandomBlur):
     """Base of the augmentations by a lens that is in focus, at infinity, on its own wavefront error."""
 
     def __init__(
-        self,
-        draws: dict[str, Draw],
-        *,
-        f_number: Bounds,
-        focal_length: float,
-        pixel_pitch: float,
-        outside: float,
-        wavelengths: Tensor | list[float] | None,
-        same_on_batch: bool,
-        p: float,
-        keepdim: bool,
+        self, draws: dict[str, Draw], *, f_number: Bounds, focal_length: float, **options: Unpack[BlurOptions]
     ) -> None:
-        super().__init__(
-            draws | {"f_number": Uniform(f_number, "log", least=0.5, most=200.0)},
-            pixel_pitch=pixel_pitch,
-            outside=outside,
-            wavelengths=wavelengths,
-            same_on_batch=same_on_batch,
-            p=p,
-            keepdim=keepdim,
-        )
+        super().__init__(draws | {"f_number": Uniform(f_number, "log", least=0.5, most=200.0)}, **options)
         self.focal_length = check_length(
             focal_length, name="focal_length", within=FOCAL_LENGTH_RANGE, example=f"{FOCAL_LENGTH:g}"
         )
@@ -319,28 +300,9 @@ class RandomDiffraction(FocusedBlur):
     """
 
     def __init__(
-        self,
-        f_number: Bounds = (8.0, 32.0),
-        *,
-        focal_length: float = FOCAL_LENGTH,
-        pixel_pitch: float = PIXEL_PITCH,
-        outside: float = 0.01,
-        wavelengths: Tensor | list[float] | None = None,
-        same_on_batch: bool = False,
-        p: float = 0.5,
-        keepdim: bool = False,
+        self, f_number: Bounds = (8.0, 32.0), *, focal_length: float = FOCAL_LENGTH, **options: Unpack[BlurOptions]
     ) -> None:
-        super().__init__(
-            {},
-            f_number=f_number,
-            focal_length=focal_length,
-            pixel_pitch=pixel_pitch,
-            outside=outside,
-            wavelengths=wavelengths,
-            same_on_batch=same_on_batch,
-            p=p,
-            keepdim=keepdim,
-        )
+        super().__init__({}, f_number=f_number, focal_length=focal_length, **options)
 
 
 class RandomAberration(FocusedBlur):
@@ -362,23 +324,13 @@ class RandomAberration(FocusedBlur):
         f_number: Bounds = (1.8, 8.0),
         *,
         focal_length: float = FOCAL_LENGTH,
-        pixel_pitch: float = PIXEL_PITCH,
-        outside: float = 0.01,
-        wavelengths: Tensor | list[float] | None = None,
-        same_on_batch: bool = False,
-        p: float = 0.5,
-        keepdim: bool = False,
+        **options: Unpack[BlurOptions],
     ) -> None:
         super().__init__(
             {"rms": Uniform(rms, least=0.0, most=5.0, unit="[waves]"), "direction": Normal(self.TERMS)},
             f_number=f_number,
             focal_length=focal_length,
-            pixel_pitch=pixel_pitch,
-            outside=outside,
-            wavelengths=wavelengths,
-            same_on_batch=same_on_batch,
-            p=p,
-            keepdim=keepdim,
+            **options,
         )
 
     def coefficients(self, drawn: dict[str, Tensor]) -> Tensor:
@@ -415,29 +367,14 @@ class RandomChromaticAberration(FocusedBlur):
         f_number: Bounds = (1.8, 8.0),
         *,
         focal_length: float = FOCAL_LENGTH,
-        pixel_pitch: float = PIXEL_PITCH,
         glass: str = "N-BK7",
-        outside: float = 0.01,
-        wavelengths: Tensor | list[float] | None = None,
-        same_on_batch: bool = False,
-        p: float = 0.5,
-        keepdim: bool = False,
+        **options: Unpack[BlurOptions],
     ) -> None:
         draws: dict[str, Draw] = {
             "axial": Uniform(axial, least=-10.0, most=10.0),
             "lateral": Uniform(lateral, least=-0.2, most=0.2),
         }
-        super().__init__(
-            draws,
-            f_number=f_number,
-            focal_length=focal_length,
-            pixel_pitch=pixel_pitch,
-            outside=outside,
-            wavelengths=wavelengths,
-            same_on_batch=same_on_batch,
-            p=p,
-            keepdim=keepdim,
-        )
+        super().__init__(draws, f_number=f_number, focal_length=focal_length, **options)
         self.glass = glass
         self.flags |= {"glass": glass}
         self.dispersion(wavelength_grid([DESIGN]))  # refuses an unknown glass

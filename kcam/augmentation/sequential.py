@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from kcam.augmentation.base import TAKES, CameraAugmentation, check_layout, wavelengths_of
 from kcam.augmentation.optics import finite_vergence
 from kcam.camera import DEMOSAICING, Camera
-from kcam.context import Context, Stage
+from kcam.context import Context, Stage, applied
 from kcam.inputs import check_array, check_floats
 from kcam.isp import ToneCurve
 from kcam.optics import Imaging
@@ -163,12 +163,11 @@ class CameraSequential(K.AugmentationSequential):
             alone = result[0]
             return alone[0] if input.ndim == 2 and alone.shape[0] == 1 else alone
         channels = input.shape[1]
+        context = self.context()
+        seen = _scene(input, depth, context) if isinstance(module, Imaging) and depth is not None else input
+        result = applied(module, seen, context)
         if isinstance(module, Stage):
-            context = self.context()
-            if isinstance(module, Imaging) and depth is not None:
-                return module(_scene(input, depth, context), context)
-            return module(input, context)
-        result = module(input)
+            return result
         after = result.shape[1] if isinstance(result, Tensor) and result.ndim == 4 else channels
         expected = self._after(module, channels)
         if after != expected:

@@ -153,9 +153,7 @@ class Evaluator:
                 given: dict[int, tuple[Tensor, Context]] = {}
                 if self.index != 0:
                     given[0] = (sample.scene.bands(), context)
-                index = 0
-                for name, signal in camera.steps(sample.scene):
-                    index += 1 + name.count(" + ")  # an Imaging that absorbs its filter is one step
+                for index, _, signal in camera.walk(sample.scene):
                     given[index] = (signal, context)
                 result += [
                     {index: (signal[row : row + 1], told) for index, (signal, told) in given.items()}

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from kcam import optics
 from kcam.camera import DEMOSAICING, Camera, is_random
-from kcam.context import Context, Stage
+from kcam.context import Context, applied
 from kcam.scene import Scene
 from kcam.style.losses import StyleLoss
 from kcam.style.processes import gathered, of_the_first, place
@@ -47,7 +47,7 @@ class Recording:
         """
         for index, stage in enumerate(self.stages):
             own = dataclasses.replace(self.context, generator=generator(row, index))
-            signal = stage(signal, own) if isinstance(stage, Stage) else stage(signal)
+            signal = applied(stage, signal, own)
         return signal
 
 

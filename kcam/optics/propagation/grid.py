@@ -21,7 +21,7 @@ from kcam.optics.propagation.row import FFT_SLOWNESS, PRODUCTS, Propagator
 from kcam.optics.propagation.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Transform
 from kcam.optics.pupil.coordinates import EDGE_MARGIN, Pupil, from_image_side, grid_nodes, grid_spacing
 from kcam.optics.pupil.quadrants import unfold
-from kcam.optics.pupil.rim import disc_weights
+from kcam.optics.pupil.rim import round_weights
 from kcam.optics.pupil.warp import Warp
 
 _GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
@@ -210,15 +210,12 @@ def _amplitude(query: Query, pupil: Pupil, *, curved: bool) -> Tensor:
 
 def _disc_weights(query: Query, *, count: int, spacing: float) -> Tensor:
     """Quadrature weights of an aperture made of discs, for x, y > 0."""
-    weights = torch.zeros(count // 2, count // 2, dtype=torch.float64)
-    for radius, weight in query.lens.aperture.discs():
 
-        def rim(tau: float, radius: float = radius) -> Tensor:
-            image_side = radius * math.sqrt((1 + tau) / (1 + tau * radius**2))
-            return disc_weights(count, spacing=spacing, radius=image_side)
+    def rims(tau: float) -> Tensor:
+        discs = ((r * math.sqrt((1 + tau) / (1 + tau * r**2)), weight) for r, weight in query.lens.aperture.discs())
+        return round_weights(tuple(discs), count, spacing=spacing)
 
-        weights = weights + weight * _following(query.tau.cpu(), rim, spacing=spacing)
-    return weights.to(query.device)
+    return _following(query.tau.cpu(), rims, spacing=spacing).to(query.device)
 
 
 def _following(tau: Tensor, evaluate: Callable[[float], Tensor], *, spacing: float) -> Tensor:
