@@ -1,0 +1,91 @@
+"""What figures share, drawn with matplotlib's object interface, so that nothing global changes."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from kcam import files
+from kcam.plots.pictures import check_writable
+
+INK, MUTED, FAINT = "#1c1c22", "#75757f", "#e2e2e8"
+TITLE, LABEL, SMALL = 15.0, 10.0, 8.5
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str], *, resolution: float = 144) -> None:
+    """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`."""
+    check_writable(path, suffixes=FIGURE_SUFFIXES)
+    files.replace(path, figure_bytes(figure, resolution=resolution, format=Path(path).suffix.lower()[1:]))
+
+
+def figure_bytes(figure: Figure, *, resolution: float = 144, format: str = "png") -> bytes:
+    """A figure as the content of a file, at `resolution` dots per inch."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=resolution, facecolor="white", format=format)
+    return content.getvalue()
+
+
+class Sheet:
+    """A figure whose parts are placed in inches from its top left corner, so that nothing overlaps at any size."""
+
+    def __init__(self, width: float, height: float) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width, height))
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Any:
+        """Axes at a place in inches."""
+        box = (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
+        return self.figure.add_axes(box)
+
+    def text(self, left: float, top: float, text: str, *, size: float = LABEL, colour: str = INK, **style: Any) -> None:
+        """Text whose top left corner is at a place in inches, unless `style` aligns it otherwise."""
+        style = {"va": "top", "ha": "left"} | style
+        self.figure.text(left / self.width, 1 - top / self.height, text, size=size, color=colour, **style)
+
+    def picture(
+        self, image: np.ndarray, left: float, top: float, width: float, height: float, *, smooth: bool = True
+    ) -> Any:
+        """A picture without axes."""
+        axes = self.axes(left, top, width, height)
+        axes.imshow(image, interpolation="antialiased" if smooth else "nearest", aspect="auto", vmin=0, vmax=1)
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+        return axes
+
+
+def duration(seconds: float) -> str:
+    """A time for people, from milliseconds to days: three figures at most."""
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.3g} {unit}"
+    if seconds >= 0.9995:
+        return f"{seconds:.3g} s" if seconds < 100 else f"{seconds:.0f} s"
+    return f"{seconds * 1e3:.0f} ms" if seconds >= 0.01 else f"{seconds * 1e3:.1f} ms"
+
+
+def quiet(axes: Any) -> None:
+    """Axes that stand back behind their curves: a faint grid, two spines, small ticks."""
+    axes.grid(color=FAINT, lw=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
+    axes.tick_params(labelsize=SMALL, colors=MUTED, length=3, which="both")
+    axes.xaxis.label.set(size=SMALL + 0.5, color=MUTED)
+
+
+def percent_or_more(share: float) -> str:
+    """A share that is not less than the text says: "97% or more", "less than 1%"."""
+    return f"{math.floor(100 * min(share, 1.0))}% or more" if share >= 0.01 else "less than 1%"
+
+
+def metres(distance: float) -> str:
+    """A distance for people."""
+    if math.isinf(distance):
+        return "infinity"
+    return f"{distance:.3g} m" if distance >= 1 else f"{distance * 100:.3g} cm"
