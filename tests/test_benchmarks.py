@@ -17,7 +17,7 @@ from rich.console import Console
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from benchmarks import augmentation, bench, peers, style_step
+from benchmarks import against, augmentation, bench, peers, style_step
 from benchmarks import patches as patch_stores
 from benchmarks.common import Contestant, race
 from kcam import augmentation as KC
@@ -336,3 +336,51 @@ def test_fifty_epochs_of_kaist_are_projected_from_a_step():
     (row,) = style_step.projected([{"who": "kcam", "seconds": 3.6}])
     assert row["steps"] == 50 * 1950  # 3900 patches, two in a step
     assert row["hours"] == pytest.approx(97.5)
+
+
+# ---- against an earlier version ------------------------------------------------------------------------------------
+
+
+class Version:
+    """A process that stops at one race, and takes so long for it in each round."""
+
+    def __init__(self, op: str, times: list[float]) -> None:
+        self.answers, self.times, self.stdin = [{"op": op}], iter(times), self
+
+    def write(self, text: str) -> None:
+        if text.strip() == "go":
+            self.answers.append(next(self.times))
+        elif text.strip() == "on":
+            self.answers.append(None)
+
+    def flush(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("again", "own", "lost"),
+    [
+        ([1.0, 1.0, 1.0], [1.02, 1.02, 1.02], False),
+        ([1.0, 1.0, 1.0], [1.04, 1.05, 0.5], True),
+        ([1.1, 0.9, 1.0], [1.1, 1.1, 1.1], False),  # as far as the earlier version is from itself
+        ([1.1, 0.9, 1.0], [1.2, 1.2, 1.2], True),
+    ],
+)
+def test_a_race_is_lost_beyond_three_percent_and_the_spread(monkeypatch, again, own, lost) -> None:
+    monkeypatch.setattr(against, "told", lambda process: process.answers.pop(0))
+    versions = [Version("psf", times) for times in ([1.0, 1.0, 1.0], again, own)]
+    (row,) = against.raced(versions, rounds=3)
+    assert row["lost"] == lost
+    assert row["seconds"]["this"] == sorted(own)[1]
+
+
+def test_versions_that_race_differently_are_not_compared(monkeypatch) -> None:
+    monkeypatch.setattr(against, "told", lambda process: process.answers.pop(0))
+    with pytest.raises(RuntimeError, match="race differently"):
+        next(against.raced([Version(op, []) for op in ("psf", "psf", "render")], rounds=1))
+
+
+def test_nothing_is_slower_than_in_the_version_before() -> None:
+    """As measured and committed."""
+    rows = json.loads(against.RESULTS.read_text())["rows"]
+    assert len(rows) >= 30
+    assert [row["op"] for row in rows if row["ratio"] > 1 + against.ALLOWED + row["spread"]] == []
