@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
 import sys
@@ -345,7 +346,7 @@ class Version:
     """A process that stops at one race, and takes so long for it in each round."""
 
     def __init__(self, op: str, times: list[float]) -> None:
-        self.answers, self.times, self.stdin = [{"op": op}], iter(times), self
+        self.answers, self.times, self.stdin = [{"op": op}], itertools.cycle(times), self
 
     def write(self, text: str) -> None:
         if text.strip() == "go":
