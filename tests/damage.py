@@ -163,6 +163,8 @@ def _read_camera(path: Path) -> None:
 def _says(whole: Any, part: Any) -> bool:
     """Whether all that a part of a configuration says is so in the whole."""
     if isinstance(part, dict) and isinstance(whole, dict):
+        if isinstance(layers := part.get("layers"), list):  # distances are kept from far to near, each once
+            part = part | {"layers": sorted(set(layers), reverse=True)}
         return all(key in whole and _says(whole[key], value) for key, value in part.items())
     if isinstance(part, list) and isinstance(whole, list):
         return len(part) == len(whole) and all(map(_says, whole, part))

@@ -19,6 +19,7 @@ from kcam.optics.numerics import lagrange, legendre, phasor
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.intensity import pupil_intensity
 from kcam.optics.propagation.pixels import Pixels
+from kcam.optics.propagation.radial import hankel_kernel
 from kcam.optics.propagation.transforms import MatrixTransform
 from kcam.optics.pupil.coordinates import Pupil, grid_nodes, grid_spacing
 from kcam.optics.pupil.quadrants import unfold
@@ -265,7 +266,8 @@ def _amplitude(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
     rho, weights = (torch.as_tensor(value, device=rim.device) for value in legendre(nodes))
     rho = (rho + 1) / 2
     phase = rim[..., None] * rho**2
-    return torch.stack([phase.cos(), phase.sin()]) * (rho * weights) @ _bessel_table(nodes, arguments, rim.device)
+    field = torch.stack([phase.cos(), phase.sin()]) * (rho * weights / (2 * math.pi))
+    return field @ _kept_kernel(nodes, arguments, rim.device)
 
 
 def _projected(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
@@ -316,10 +318,9 @@ class _Fresnel(torch.autograd.Function):
 
 @functools.lru_cache(maxsize=12)
 @torch.inference_mode(False)  # what is kept must serve training too
-def _bessel_table(nodes: int, arguments: int, device: torch.device) -> Tensor:
-    """J0(t rho), (n, T)."""
+def _kept_kernel(nodes: int, arguments: int, device: torch.device) -> Tensor:
     rho = torch.as_tensor(legendre(nodes)[0], device=device) / 2 + 0.5
-    return torch.special.bessel_j0(rho[:, None] * torch.arange(arguments, dtype=torch.float64, device=device) * _STEP)
+    return hankel_kernel(torch.arange(arguments, dtype=torch.float64, device=device) * _STEP, rho)
 
 
 @functools.lru_cache(maxsize=16)

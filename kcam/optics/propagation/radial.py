@@ -44,7 +44,8 @@ def radial_psf(query: Query) -> Tensor:
     field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
     field, rho = fewer_nodes(field, rho, frequency=largest * corner)
 
-    t = torch.arange(math.ceil(largest * corner / _TABLE_STEP) + 8, dtype=torch.float64, device=query.device)
+    steps = math.ceil(largest * corner / _TABLE_STEP) + 8
+    t = torch.arange(steps, dtype=torch.float64, device=query.device) * _TABLE_STEP
     parts = list(zip(*(part.split(max(1, _RINGS_AT_ONCE // t.numel()), dim=-1) for part in (field, rho)), strict=True))
     if len(parts) == 1:
         transformed = _hankel(field, t, rho)  # (2, L, Z, T)
@@ -64,9 +65,13 @@ def radial_psf(query: Query) -> Tensor:
     return torch.stack(bands, dim=1)
 
 
+def hankel_kernel(t: Tensor, rho: Tensor) -> Tensor:
+    """2 pi J0(t rho), (n, T): what a field over rings (..., n) is multiplied with."""
+    return 2 * math.pi * BesselJ0.apply(t[:, None] * rho).T
+
+
 def _hankel(field: Tensor, t: Tensor, rho: Tensor) -> Tensor:
-    """2 pi SUM field J0(t rho) at the table's arguments: (..., n) -> (..., T)."""
-    return 2 * math.pi * field @ BesselJ0.apply(t[:, None] * _TABLE_STEP * rho).T
+    return field @ hankel_kernel(t, rho)
 
 
 def ring_nodes(query: Query, frequency: float, *, density: float = 1.0) -> tuple[Tensor, Tensor]:

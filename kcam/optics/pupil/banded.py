@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 _SLAB_NODES, _SLAB_PIXELS = 16, 32  # narrow enough to leave out most zeros, wide enough for a matrix product
+
+
+def pieces(slabs: Sequence[Tensor], starts: Sequence[int], *, terms: int = 1) -> Iterator[tuple[Tensor, slice, slice]]:
+    """(slab, its inputs, its outputs) of a banded matrix in slabs of columns, of so many terms side by side."""
+    at = 0
+    for slab, start in zip(slabs, starts, strict=True):
+        columns = slab.shape[1] // terms
+        yield slab, slice(start, start + slab.shape[0]), slice(at, at + columns)
+        at += columns
 
 
 @dataclass(frozen=True)
@@ -34,19 +43,12 @@ class Banded:
             starts.append(low)
         return Banded(tuple(slabs), tuple(starts), outputs)
 
-    def _pieces(self) -> Iterator[tuple[Tensor, slice, slice]]:
-        """(matrix, its inputs, its outputs)."""
-        at = 0
-        for slab, start in zip(self.slabs, self.starts, strict=True):
-            yield slab, slice(start, start + slab.shape[0]), slice(at, at + slab.shape[1])
-            at += slab.shape[1]
-
     def __call__(self, field: Tensor) -> Tensor:
         half = field.new_empty(field.shape[0], self.outputs)
-        for matrix, source, target in self._pieces():
+        for matrix, source, target in pieces(self.slabs, self.starts):
             torch.mm(field[:, source], matrix, out=half[:, target])
         grid = field.new_empty(self.outputs, self.outputs)
-        for matrix, source, target in self._pieces():
+        for matrix, source, target in pieces(self.slabs, self.starts):
             torch.mm(matrix.T, half[source], out=grid[target])
         return grid
 

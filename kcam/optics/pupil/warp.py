@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcam.optics.pupil.banded import pieces
 from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.rim import kaiser_sinc
 
@@ -80,7 +81,7 @@ class Warp:
 
     def _along(self, field: Tensor, displacement: Tensor) -> Tensor:
         out = torch.empty_like(displacement)
-        for slab, source, target in self._pieces():
+        for slab, source, target in pieces(self.slabs, self.starts, terms=self.terms):
             terms = (field[:, source] @ slab).view(field.shape[0], self.terms, -1)
             result = terms[:, 0]
             for term, polynomial in zip(terms[:, 1:].unbind(1), _chebyshev(displacement[:, target]), strict=False):
@@ -90,21 +91,13 @@ class Warp:
 
     def _back(self, grid: Tensor, displacement: Tensor) -> Tensor:
         field = torch.zeros_like(displacement)
-        for slab, source, target in self._pieces():
+        for slab, source, target in pieces(self.slabs, self.starts, terms=self.terms):
             terms = slab.new_empty(grid.shape[0], self.terms, slab.shape[1] // self.terms)
             terms[:, 0] = part = grid[:, target]
             for term, polynomial in zip(terms[:, 1:].unbind(1), _chebyshev(displacement[:, target]), strict=False):
                 torch.mul(part, polynomial, out=term)
             field[:, source].addmm_(terms.flatten(1), slab.T)
         return field
-
-    def _pieces(self) -> Iterator[tuple[Tensor, slice, slice]]:
-        """(slab, its inputs, its outputs)."""
-        at = 0
-        for slab, start in zip(self.slabs, self.starts, strict=True):
-            columns = slab.shape[1] // self.terms
-            yield slab, slice(start, start + slab.shape[0]), slice(at, at + columns)
-            at += columns
 
 
 def _chebyshev(u: Tensor) -> Iterator[Tensor]:
