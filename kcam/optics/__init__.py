@@ -1,6 +1,8 @@
 """Wave optics: from a point of light to its image on the sensor, and from a scene to the light in each pixel."""
 
 from kcam.optics.accuracy import Accuracy
+from kcam.optics.compound.lens import CompoundLens
+from kcam.optics.compound.surface import Surface
 from kcam.optics.elements import (
     DOE,
     AnnularAperture,
@@ -16,7 +18,7 @@ from kcam.optics.elements import (
     ZernikeAberration,
     ZernikeDOE,
 )
-from kcam.optics.elements.materials import GLASSES, refractive_index
+from kcam.optics.elements.materials import GLASSES, Glass, refractive_index
 from kcam.optics.imaging import Imaging
 from kcam.optics.lens import Lens
 from kcam.optics.measured import MeasuredPSF
@@ -32,8 +34,10 @@ __all__ = [
     "AnnularAperture",
     "ApertureMap",
     "CircularAperture",
+    "CompoundLens",
     "Defocus",
     "Element",
+    "Glass",
     "Imaging",
     "Lens",
     "MeasuredPSF",
@@ -41,6 +45,7 @@ __all__ = [
     "PlanoConvexLens",
     "RadialDOE",
     "SquareAperture",
+    "Surface",
     "ThinLens",
     "ZernikeAberration",
     "ZernikeDOE",

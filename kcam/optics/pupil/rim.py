@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 _EDGE_HALF_WIDTH = 6  # samples; half width of the low-pass for edge weights
+_PROFILE_STEPS = 256
 FINE = 5  # cells per sample in which the area of the rim is measured exactly
 _NODES_AT_ONCE = 32  # rows of edge weights; more take more memory than the cells that they share take time
 
@@ -51,6 +52,24 @@ def _edge_spectrum() -> tuple[np.ndarray, np.ndarray]:
 def edge_response(frequency: np.ndarray) -> np.ndarray:
     """What edge weights leave of the light that a rim diffracts, at a frequency in cycles per sample, >= 0."""
     return np.interp(frequency, *_edge_spectrum(), right=0.0)
+
+
+@functools.lru_cache(maxsize=1)
+@torch.inference_mode(False)
+def _edge_integral() -> Tensor:
+    """Of the low-pass, from far outside an edge to far inside, at _PROFILE_STEPS points for each sample."""
+    steps = np.arange(-_EDGE_HALF_WIDTH * _PROFILE_STEPS, _EDGE_HALF_WIDTH * _PROFILE_STEPS + 1) / _PROFILE_STEPS
+    kernel = kaiser_sinc(steps, half_width=_EDGE_HALF_WIDTH, beta=13.2)
+    integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)])
+    return torch.as_tensor(integral / integral[-1])
+
+
+def edge_profile(distance: Tensor) -> Tensor:
+    """Weight of a sample so far inside a straight edge [samples], float64: the low-passed step, 0 outside, 1 inside."""
+    table = _edge_integral().to(distance.device)
+    position = ((distance + _EDGE_HALF_WIDTH) * _PROFILE_STEPS).clamp(0, len(table) - 1.001)
+    low = position.detach().long()
+    return table[low] + (position - low) * (table[low + 1] - table[low])
 
 
 @functools.lru_cache(maxsize=64)

@@ -1,0 +1,426 @@
+"""A real lens from its prescription: exact rays in float64, and the PSFs of any point of the field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from kcam.inputs import as_values
+from kcam.optics.compound import pupil
+from kcam.optics.compound.presets import preset_surfaces
+from kcam.optics.compound.surface import Surface
+from kcam.optics.compound.tracing import Rays, system_matrix, trace
+from kcam.optics.elements.element import set_scalar
+from kcam.optics.numerics import Scalar, float64, phasor, squared
+from kcam.optics.propagation import sampling
+from kcam.optics.propagation.pixels import Pixels
+from kcam.optics.source import PixelGrid
+from kcam.units import check_distances, check_pixel_pitch, check_positive, check_trained, wavelength_grid
+
+_AIMING = 10  # steps of the secant that aims a chief ray
+_AIMED = 1e-9  # of the stop's semi-diameter
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Paraxial quantities at one wavelength [m]; positions are along the axis, of the entrance pupil from the first
+    vertex and of the others from the last, positive behind it.
+    """
+
+    focal_length: Tensor
+    back_focus: Tensor
+    entrance_pupil: Tensor
+    entrance_semi_diameter: Tensor
+    exit_pupil: Tensor
+    exit_semi_diameter: Tensor
+
+
+class CompoundLens(nn.Module):
+    """Refracting surfaces with a common axis, an aperture stop among them, in front of a sensor.
+
+    Args:
+        surfaces: in the order of the light; exactly one is the stop.
+        focus_distance: sets the sensor where an object at this distance in front of the first vertex is imaged [m],
+            paraxially, at `focus_wavelength`, once. sensor_distance: from the last vertex to the sensor [m], instead.
+        focus_wavelength: [m].
+    Raises: ValueError for not exactly one stop, both or neither distance, a focus that does not exist, glass in front
+        of the sensor; TypeError for what is no Surface.
+    Valid for scalar light; surfaces are refracting, without coatings, and share one axis. PSFs are good to 1e-3 of
+    their light down to f/4, and 3e-3 at f/1.85, against a sum over rays (tests/optics/test_compound.py).
+    Object points are (X / D, Y / D) with D from the paraxial entrance pupil; light falls as in `units`: a point at
+    (0, +t) lands at y of about -f t.
+    """
+
+    surfaces: Sequence[Surface]
+    sensor_distance: Scalar
+
+    def __init__(
+        self,
+        *surfaces: Surface,
+        focus_distance: float | None = None,
+        sensor_distance: Scalar | None = None,
+        focus_wavelength: float = 550e-9,
+    ) -> None:
+        super().__init__()
+        for surface in surfaces:
+            if not isinstance(surface, Surface):
+                raise TypeError(f"a compound lens takes optics.Surface, got {type(surface).__name__}.")
+        stops = sum(surface.stop for surface in surfaces)
+        if stops != 1:
+            raise ValueError(f"a compound lens has exactly one stop, got {stops}: Surface(..., stop=True).")
+        if surfaces[-1].glass is not None:
+            raise ValueError("the last surface has glass behind it, but the sensor stands in air: glass=None.")
+        self.surfaces = nn.ModuleList(surfaces)  # type: ignore[assignment]
+        self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
+        if focus_distance is not None and sensor_distance is None:
+            sensor_distance = self._focused(float(check_distances(focus_distance, name="focus_distance")))
+        elif focus_distance is not None or sensor_distance is None:
+            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
+        check_positive(sensor_distance, name="sensor_distance")
+        set_scalar(self, "sensor_distance", sensor_distance)
+
+    @classmethod
+    def preset(cls, name: str, *, focus_distance: float = math.inf, focus_wavelength: float = 550e-9) -> CompoundLens:
+        """A lens from its patent: a name in `presets.PRESETS`. Raises: ValueError for an unknown one."""
+        return cls(*preset_surfaces(name), focus_distance=focus_distance, focus_wavelength=focus_wavelength)
+
+    def configuration(self) -> dict[str, object]:
+        """Constructor arguments, for saving: the sensor's distance, which was set once, rather than the focus."""
+        return {
+            "surfaces": list(self.surfaces),
+            "sensor_distance": self.sensor_distance,
+            "focus_wavelength": self.focus_wavelength,
+        }
+
+    def check(self) -> None:
+        """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
+        for name, value in (*self.named_parameters(), *self.named_buffers()):
+            check_trained(value, name=f"{name} of the lens")
+        for surface in self.surfaces:
+            surface.check()
+        check_positive(self.sensor_distance, name="sensor_distance")
+
+    # ---- paraxial --------------------------------------------------------------------------------------------------
+
+    @property
+    def stop(self) -> int:
+        """Which surface is the aperture stop."""
+        return next(k for k, surface in enumerate(self.surfaces) if surface.stop)
+
+    def indices(self, wavelengths: Tensor) -> list[Tensor]:
+        """Refractive index in front of the lens and behind each surface, K + 1 of (L,) float64."""
+        return [torch.ones_like(wavelengths), *(surface.index(wavelengths) for surface in self.surfaces)]
+
+    def first_order(self, wavelength: float | None = None) -> FirstOrder:
+        """Focal length and pupils at a wavelength [m]; None for that of focus."""
+        grid = wavelength_grid([self.focus_wavelength if wavelength is None else wavelength])
+        indices = [index[0] for index in self.indices(grid)]
+        matrix = system_matrix(self.surfaces, indices)
+        front = system_matrix(self.surfaces[: self.stop + 1], indices, refract_last=False)
+        # behind the stop: from its vertex, which refracts, to the last
+        back = system_matrix(self.surfaces[self.stop :], indices[self.stop :])
+        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        return FirstOrder(
+            focal_length=-1 / matrix[1, 0],
+            back_focus=-matrix[0, 0] / matrix[1, 0],
+            entrance_pupil=front[0, 1] / front[0, 0],
+            entrance_semi_diameter=semi / front[0, 0].abs(),
+            exit_pupil=-back[0, 1] / back[1, 1],
+            exit_semi_diameter=semi / back[1, 1].abs(),
+        )
+
+    def focal_length(self, wavelength: float | None = None) -> float:
+        """Paraxial [m]."""
+        return float(self.first_order(wavelength).focal_length.detach())
+
+    @property
+    def f_number(self) -> float:
+        """Working f-number: from the exit pupil to the sensor, over its width."""
+        first = self.first_order()
+        distance = float64(self.sensor_distance) - first.exit_pupil
+        return float((distance / (2 * first.exit_semi_diameter)).detach())
+
+    def _focused(self, distance: float) -> float:
+        indices = [index[0].detach() for index in self.indices(wavelength_grid([self.focus_wavelength]))]
+        matrix = system_matrix(self.surfaces, indices).detach()
+        ray = matrix @ torch.tensor([1.0, 1 / distance], dtype=torch.float64)  # of height 1 at the first vertex
+        if float(ray[1]) >= 0:
+            raise ValueError(
+                f"an object at {distance:g} m has no real image: the focal length is {-1 / float(matrix[1, 0]):g} m. "
+                "Focus farther away."
+            )
+        image = float(-ray[0] / ray[1])
+        if image <= 0:
+            raise ValueError(f"an object at {distance:g} m is imaged {-image:g} m inside the lens, not behind it.")
+        return image
+
+    # ---- exact rays ------------------------------------------------------------------------------------------------
+
+    def launch(self, heights: Tensor, vergences: Tensor, px: Tensor, py: Tensor) -> Rays:
+        """Rays at the plane of the first vertex, from points at (0, heights) through (px, py) of the entrance pupil.
+
+        Args: heights: Y / D. vergences: 1 / distance from the first vertex [1/m]. px, py: [m]; all broadcast.
+        """
+        e = self.first_order().entrance_pupil.to(px.device)
+        v = vergences / (1 + vergences * e)  # from the entrance pupil
+        sx, sy = px * v, py * v - heights
+        n = torch.rsqrt(1 + sx**2 + sy**2)
+        x, y = px - e * sx, py - e * sy
+        tau = heights * (1 + vergences * e)
+        # from the object to here, less what its ray through the vertex travels: does not cancel at any distance
+        root = torch.sqrt((vergences * x) ** 2 + (vergences * y - tau) ** 2 + 1)
+        path = (vergences * (x**2 + y**2) - 2 * y * tau) / (root + torch.sqrt(tau**2 + 1))
+        alive = torch.ones_like(n, dtype=torch.bool)
+        x, y, dx, dy, path = torch.broadcast_tensors(x, y, sx * n, sy * n, path)
+        return Rays(x, y, dx, dy, path, alive)
+
+    def aimed(self, heights: Tensor, vergences: Tensor, indices: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Height in the entrance pupil at which chief rays pass the middle of the stop [m], and how the stop's x and y
+        follow those of the entrance pupil there; shape of what broadcasts.
+        """
+        first = self.first_order()
+        step = 1e-3 * first.entrance_semi_diameter.detach()
+
+        def landed(px: Tensor, py: Tensor) -> Rays:
+            return trace(self.surfaces, self.launch(heights, vergences, px, py), indices, until=self.stop)
+
+        shape = torch.broadcast_shapes(heights.shape, vergences.shape, *(index.shape for index in indices))
+        zero = torch.zeros(shape, dtype=torch.float64, device=heights.device)
+        with torch.no_grad():
+            before, now = zero, zero + step
+            low, high = (landed(zero, at).y for at in (before, now))
+            for _ in range(_AIMING):
+                slope = (high - low) / torch.where(now == before, 1.0, now - before)
+                slope = torch.where(slope.abs() < 1e-6, 1.0, slope)
+                before, low, now = now, high, now - high / slope
+                high = landed(zero, now).y
+            along = (landed(zero, now + step).y - high) / step
+            across = landed(zero + step, now).x / step
+        return now - landed(zero, now).y / along, across, along
+
+    def _bundle(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> tuple[Rays, Rays]:
+        """The chief ray (F, Z, L, 1) and rays that overfill the stop (F, Z, L, R) at the sensor."""
+        device = heights.device
+        indices = [index.to(device)[None, None, :, None] for index in self.indices(wavelengths)]
+        t, v = heights[:, None, None, None], vergences[None, :, None, None]
+        aim, across, along = self.aimed(t, v, indices)
+        semi = float64(self.surfaces[self.stop].semi_diameter).detach()  # type: ignore[arg-type]
+        x, y = pupil.rays_over_stop(device)
+        px, py = x * (semi / across.abs()), aim + y * (semi / along.abs())
+        chief, bundle = (
+            self._to_sensor(trace(self.surfaces, self.launch(t, v, a, b), indices))
+            for a, b in ((torch.zeros_like(aim), aim), (px, py))
+        )
+        if not bool(chief.alive.all()):
+            height = float(t.expand(chief.alive.shape)[~chief.alive].max())
+            raise ValueError(
+                f"the chief ray of a point at {height:.3g} (Y / D) misses a surface or is totally reflected: the field "
+                "of this lens is smaller. Use smaller fields."
+            )
+        return chief, bundle
+
+    def _to_sensor(self, rays: Rays) -> Rays:
+        t = float64(self.sensor_distance).to(rays.x.device) / rays.dz
+        return Rays(
+            rays.x + t * rays.dx, rays.y + t * rays.dy, rays.dx, rays.dy, rays.path + t, rays.alive, rays.clearance
+        )
+
+    def opd(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        field: Tensor | None = None,
+        samples: int = 65,
+    ) -> tuple[Tensor, Tensor]:
+        """Wavefront over the stop in waves, and where light passes: (F, Z, L, S, S), without `field` (Z, L, S, S).
+
+        On the sphere about the image of the chief ray through the middle of the paraxial exit pupil; positive where
+        light comes late. Rays are aimed at the stop: S x S points of its bounding square, rows along +y.
+        """
+        asked = self._asked(wavelengths, distances, field)
+        indices = [index[None, None, :, None] for index in self.indices(asked.wavelengths)]
+        t, v = asked.heights[:, None, None, None], asked.vergences[None, :, None, None]
+        aim, across, along = self.aimed(t, v, indices)
+        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        side = torch.linspace(-1, 1, samples, dtype=torch.float64)
+        x, y = (part.flatten() for part in torch.meshgrid(side, side, indexing="xy"))
+        # the stop's own axes turn with the field
+        cx, cy = (part[:, None, None, None] for part in asked.directions.unbind(1))
+        to_x, to_y = semi * (x * cy - y * cx), semi * (x * cx + y * cy)
+        with torch.no_grad():
+            px, py = to_x / across, aim + to_y / along
+            for _ in range(_AIMING):
+                at = trace(self.surfaces, self.launch(t, v, px, py), indices, until=self.stop)
+                px, py = px - (at.x - to_x) / across, py - (at.y - to_y) / along
+        chief, rays = (
+            self._to_sensor(trace(self.surfaces, self.launch(t, v, a, b), indices))
+            for a, b in ((torch.zeros_like(aim), aim), (px, py))
+        )
+        radius = float64(self.sensor_distance) - self.first_order().exit_pupil
+        ox, oy = rays.x - chief.x, rays.y - chief.y
+        onto = ox * rays.dx + oy * rays.dy
+        back = onto + radius.sign() * torch.sqrt((onto**2 - ox**2 - oy**2 + radius**2).clamp(min=0))
+        waves = (rays.path - back - chief.path + radius) / asked.wavelengths[:, None]
+        clearances = torch.stack(rays.clearance, dim=-2)
+        passes = rays.alive & (clearances > -1e-9).all(-2) & (x**2 + y**2 <= 1 + 1e-9)
+        found = [part.expand(waves.shape).unflatten(-1, (samples, samples)) for part in (waves, passes)]
+        return (found[0], found[1]) if field is not None else (found[0][0], found[1][0])
+
+    def pupils(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> pupil.PupilFit:
+        """Pupils of F x Z x L nodes, in this order: heights (F,) >= 0, vergences (Z,) [1/m], wavelengths (L,) [m]."""
+        chief, rays = self._bundle(wavelengths, vergences, heights)
+        wavefront = rays.path - rays.dx * rays.x - rays.dy * (rays.y - chief.y) - chief.path
+        clearances = torch.stack(rays.clearance, dim=-2)
+        flat = [part.flatten(0, 2) for part in (rays.dx, rays.dy, wavefront, clearances, rays.alive, chief.y[..., 0])]
+        return pupil.fit(*flat, enough=pupil.ENOUGH * float(wavelengths.min()))
+
+    # ---- images of points ------------------------------------------------------------------------------------------
+
+    def image_point(
+        self, wavelengths: Tensor | list[float], *, distances: Tensor | float, field: Tensor | None = None
+    ) -> Tensor:
+        """Where each wavelength's chief ray lands on the sensor [m]: (F, Z, L, 2), without `field` (Z, L, 2)."""
+        asked = self._asked(wavelengths, distances, field)
+        chief = self._bundle(asked.wavelengths, asked.vergences, asked.heights)[0].y[..., 0]
+        found = chief[..., None] * asked.directions[:, None, None]
+        return found if field is not None else found[0]
+
+    def relative_illumination(
+        self,
+        field: Tensor,
+        *,
+        wavelengths: Tensor | list[float] | None = None,
+        distances: Tensor | float = math.inf,
+    ) -> Tensor:
+        """Irradiance of a uniform radiance, over that on the axis, (F,): mean over wavelengths and distances."""
+        asked = self._asked([self.focus_wavelength] if wavelengths is None else wavelengths, distances, field)
+        heights = torch.cat([asked.heights.new_zeros(1), asked.heights])
+        fitted = self.pupils(asked.wavelengths, asked.vergences, heights)
+        areas = torch.stack([_area(fitted, node) for node in range(len(fitted.centre))]).view(len(heights), -1)
+        return (areas[1:] / areas[:1]).mean(1)
+
+    def distortion(self, field: Tensor, *, wavelength: float | None = None, distance: float = math.inf) -> Tensor:
+        """Height of the chief ray's image over that of a lens without distortion, less 1, (F,)."""
+        asked = self._asked([self.focus_wavelength if wavelength is None else wavelength], distance, field)
+        near = 1e-4 * torch.ones(1, dtype=torch.float64)
+        heights = torch.cat([near, asked.heights])
+        landed = self._bundle(asked.wavelengths, asked.vergences, heights)[0].y[:, 0, 0, 0]
+        ideal = landed[0] / near[0] * asked.heights
+        return torch.where(asked.heights > 0, landed[1:] / torch.where(ideal == 0, 1.0, ideal) - 1, 0.0)
+
+    def psf(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        field: Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+        integrate: bool = True,
+    ) -> Tensor:
+        """Energy of a point's image in each pixel, relative to the light of a point on the axis.
+
+        Args: as of `Lens.psf`; field: (F, 2) of object points.
+        Returns: (F, Z, L, H, W), without `field` (Z, L, H, W); sums to the relative illumination, less what leaves the
+            window, whose centre is where the chief ray of the focus wavelength lands.
+        """
+        asked = self._asked(wavelengths, distances, field)
+        pixels = PixelGrid(check_pixel_pitch(pixel_pitch), shape, integrate=integrate, dtype=dtype)
+        grid = wavelength_grid([*asked.wavelengths.tolist(), self.focus_wavelength])
+        heights = torch.cat([asked.heights, asked.heights.new_zeros(1)])
+        fitted = self.pupils(grid, asked.vergences, heights)
+        node = torch.arange(len(fitted.centre)).view(len(heights), len(asked.vergences), len(grid))
+        area = {index: _area(fitted, index) for index in node[..., :-1].flatten().tolist()}
+        bank = []
+        for f, direction in enumerate(asked.directions):
+            for z in range(len(asked.vergences)):
+                for k, wavelength in enumerate(asked.wavelengths.tolist()):
+                    own, axis, middle = int(node[f, z, k]), int(node[-1, z, k]), int(node[f, z, -1])
+                    offset = fitted.chief[own] - fitted.chief[middle]
+                    image = _image(fitted, own, wavelength, direction, offset, pixels)
+                    bank.append(image * (area[own] / area[axis]).to(dtype))
+        found = torch.stack(bank).view(len(asked.heights), len(asked.vergences), -1, *pixels.shape)
+        return found if field is not None else found[0]
+
+    def _asked(self, wavelengths: Tensor | list[float], distances: Tensor | float, field: Tensor | None) -> _Asked:
+        self.check()
+        points = torch.zeros(1, 2, dtype=torch.float64)
+        if field is not None:
+            points = as_values(field, name="field", unit="X / D, Y / D").to(torch.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not bool(points.isfinite().all()):
+            raise ValueError(f"field must be finite, (F, 2) of X / D and Y / D, got shape {tuple(points.shape)}.")
+        heights = points.square().sum(1).clamp(min=1e-300).sqrt() * (points != 0).any(1)
+        away = torch.where(heights[:, None] > 0, points / heights.clamp(min=1e-150)[:, None], points.new_tensor([0, 1]))
+        return _Asked(wavelength_grid(wavelengths), 1 / check_distances(distances).reshape(-1), heights, away)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """wavelengths (L,), vergences (Z,); heights (F,) of field points, and their directions on the sensor (F, 2)."""
+
+    wavelengths: Tensor
+    vergences: Tensor
+    heights: Tensor
+    directions: Tensor
+
+
+_AREA_SAMPLES = 256
+
+
+def _grid(fitted: pupil.PupilFit, node: int, direction: Tensor, count: int) -> tuple[Tensor, float, Tensor, Tensor]:
+    """Nodes (N,) about the middle of a pupil, their spacing, and the meridional dx, dy of the grid on sensor axes."""
+    spacing = 2 * _half(fitted, node) / (count - 12)  # beyond the edge there is room for its low-pass
+    nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
+    middle = (fitted.middle[node] * direction / spacing).round() * spacing
+    x, y = middle[0] + nodes[None, :], middle[1] + nodes[:, None]
+    return nodes, spacing, x * direction[1] - y * direction[0], x * direction[0] + y * direction[1]
+
+
+def _half(fitted: pupil.PupilFit, node: int) -> float:
+    """Half the width of a grid over a pupil [direction cosine], in steps: it does not follow small changes."""
+    return 2 ** (math.ceil(16 * math.log2(float(fitted.reach[node])) + 0.5) / 16)
+
+
+def _area(fitted: pupil.PupilFit, node: int) -> Tensor:
+    """Of the open pupil in direction cosines."""
+    _, spacing, dx, dy = _grid(fitted, node, torch.tensor([0.0, 1.0], dtype=torch.float64), _AREA_SAMPLES)
+    return pupil.opening(fitted.at(node, dx, dy)[1], spacing=spacing).sum() * spacing**2
+
+
+def _image(
+    fitted: pupil.PupilFit, node: int, wavelength: float, direction: Tensor, offset: Tensor, pixels: PixelGrid
+) -> Tensor:
+    """PSF of one node on the pixels, relative to what passes its pupil, (h, w); offset: of its chief ray [m]."""
+    half = _half(fitted, node)
+    _, coarse, dx, dy = _grid(fitted, node, direction, 65)
+    with torch.no_grad():
+        path, q = fitted.at(node, dx, dy)
+        slope = torch.stack(torch.gradient(path, spacing=coarse)).square().sum(0).sqrt()
+        spread = float(torch.where((q > 0).all(0), slope, 0.0).max()) + abs(float(offset))
+    margin = max(pixels.shape) // 2 + (sampling.WINDOW_MARGIN if pixels.integrate else 0)
+    scale = {"semi_aperture": half, "sensor_distance": 1.0, "wavelength": wavelength}
+    count = sampling.pupil_samples(**scale, half_window=margin * pixels.pitch, displacement=spread)
+    if count > sampling.MAX_PUPIL_SAMPLES:
+        raise ValueError(
+            f"this PSF needs {count} pupil samples (blur {spread * 1e3:.3g} mm), more than "
+            f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape or a distance nearer to the focus."
+        )
+    nodes, spacing, dx, dy = _grid(fitted, node, direction, count)
+    path, q = fitted.at(node, dx, dy)
+    passed = pupil.opening(q, spacing=spacing)
+    wavenumber = 2 * math.pi / wavelength
+    field = phasor(wavenumber * path) * passed
+    per_pixel = sampling.points_per_pixel(pixel_pitch=pixels.pitch, **scale) if pixels.integrate else 1.0
+    reach = math.ceil(per_pixel * margin)
+    points = torch.arange(-reach, reach + 1, dtype=torch.float64) * (pixels.pitch / per_pixel)
+    rows, columns = (phasor(wavenumber * (points - offset * along)[:, None] * nodes) for along in direction.flip(0))
+    complex_dtype = pixels.dtype.to_complex()
+    image = squared(rows.to(complex_dtype) @ field.to(complex_dtype) @ columns.to(complex_dtype).T)
+    factor = (spacing * pixels.pitch / wavelength) ** 2 / passed.sum()
+    return Pixels(pixels.shape, per_pixel, integrate=pixels.integrate).of_image(image) * factor.to(pixels.dtype)
