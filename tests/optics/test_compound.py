@@ -301,23 +301,26 @@ def huygens(lens: optics.CompoundLens, height: float, distance: float, points: n
 
 
 @pytest.mark.parametrize(
-    ("name", "height", "distance", "allowed"),
+    ("name", "height", "distance", "rays", "allowed"),
     [
-        pytest.param("cooke_triplet", 0.0, 2.0, 1.5e-3, marks=pytest.mark.slow),
-        ("cooke_triplet", 0.25, 2.0, 1.5e-3),
-        pytest.param("cooke_triplet", 0.36, 1.5, 1.5e-3, marks=pytest.mark.slow),
-        pytest.param("ef50", 0.2, 2.0, 4e-3, marks=pytest.mark.slow),
+        ("cooke_triplet", 0.25, 2.0, 300, 5e-3),
+        pytest.param("cooke_triplet", 0.0, 2.0, 700, 1.5e-3, marks=pytest.mark.slow),
+        pytest.param("cooke_triplet", 0.25, 2.0, 700, 1.5e-3, marks=pytest.mark.slow),
+        pytest.param("cooke_triplet", 0.36, 1.5, 700, 1.5e-3, marks=pytest.mark.slow),
+        pytest.param("ef50", 0.2, 2.0, 700, 4e-3, marks=pytest.mark.slow),
     ],
 )
-def test_psfs_are_those_of_a_sum_over_rays(name: str, height: float, distance: float, allowed: float) -> None:
-    """Of 700 x 700 rays, whose edge is a staircase: twice as many change it by 1e-3 (triplet) and 2e-3 (EF50)."""
+def test_psfs_are_those_of_a_sum_over_rays(
+    name: str, height: float, distance: float, rays: int, allowed: float
+) -> None:
+    """Whose edge is a staircase: twice as many change it by 1e-3 (triplet) and 2e-3 (EF50)."""
     lens = optics.CompoundLens.preset(name, focus_distance=2.0)
     side = np.arange(-5, 6) * 4 * um
     points = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     field = torch.tensor([[0.0, height]], dtype=DOUBLE)
     where = {"distances": distance, "pixel_pitch": 4 * um, "shape": (11, 11), "dtype": DOUBLE, "integrate": False}
     found = lens.psf([LINE], field=field, **where)[0, 0, 0]
-    truth = torch.as_tensor(huygens(lens, height, distance, points, rays=700)).view(11, 11)
+    truth = torch.as_tensor(huygens(lens, height, distance, points, rays=rays)).view(11, 11)
     truth = truth * (4 * um) ** 2 * float(lens.relative_illumination(field, distances=distance))
     error = float((found - truth).abs().sum() / truth.sum())
     print(f"{name} at {height}: {error:.1e}")

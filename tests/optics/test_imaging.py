@@ -840,7 +840,9 @@ def each_border_once() -> Iterator[Any]:
 
 @pytest.mark.parametrize(("border", "strips", "held"), list(each_border_once()))
 @pytest.mark.parametrize("factors", [None, 5])
-@pytest.mark.parametrize("bands", [3, 1000], ids=["in parts", "at once"])
+@pytest.mark.parametrize(
+    "bands", [pytest.param(3, id="in parts"), pytest.param(1000, id="at once", marks=pytest.mark.slow)]
+)
 def test_the_contraction_has_the_gradient_of_its_formula(
     monkeypatch, border: str, factors: int | None, bands: int, held: int, strips: int
 ) -> None:

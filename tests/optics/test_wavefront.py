@@ -49,7 +49,7 @@ def random_aberrations(draw: Draw, terms: int = 11) -> Tensor:
     [
         ("nonparaxial", 64, 1e-4),
         ("fresnel", 33, 1e-4),
-        ("angular_spectrum", 64, 1e-5),
+        pytest.param("angular_spectrum", 64, 1e-5, marks=pytest.mark.slow),
         ("geometric", 128, 1e-4),
         pytest.param("reference", 64, 1e-5, marks=pytest.mark.slow),
         pytest.param("reference", 256, 1e-7, marks=pytest.mark.slow),
@@ -67,8 +67,11 @@ def test_a_map_of_zernikes_is_the_zernikes(propagator: str, count: int, allowed:
     assert apart(found, exact) < allowed * (10 if width > 5.5 * mm else 1)
 
 
+SLOW = pytest.param("angular_spectrum", marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize("aperture", [optics.SquareAperture(4 * mm), optics.CircularAperture(4 * mm)])
-@pytest.mark.parametrize("propagator", ["nonparaxial", "fresnel", "angular_spectrum", "geometric"])
+@pytest.mark.parametrize("propagator", ["nonparaxial", "fresnel", SLOW, "geometric"])
 def test_an_amplitude_dims_as_a_map_of_the_aperture_does(aperture: optics.Element, propagator: str) -> None:
     transmission = Draw(3).noise(8, 8)
     flat = torch.zeros(8, 8, dtype=DOUBLE)
