@@ -85,8 +85,12 @@ class Accuracy(Recipe):
             raise ValueError(f"unknown coverage {self.coverage!r}; known: {', '.join(COVERAGES)}.")
         for name, of in (("bands", "wavelengths"), ("tile", "pixels"), ("rank", "factors")):
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be a positive number of {of}, or None, got {value}.")
+            if value is not None and not _is_count(value):
+                raise ValueError(f"{name} must be a positive number of {of}, or None, got {value!r}.")
+        shape = self.psf_shape
+        if shape is not None and not (isinstance(shape, Sequence) and len(shape) == 2 and all(map(_is_count, shape))):
+            fix = f" Use ({shape}, {shape})." if _is_count(shape) else ""
+            raise ValueError(f"psf_shape must be two positive integers (H, W) in pixels, or None, got {shape!r}.{fix}")
         if self.kappa is not None and not self.kappa > 1:
             raise ValueError(f"kappa must be above 1 sample per fringe, got {self.kappa:g}. Its default is {KAPPA:g}.")
         if self.precision not in (None, "float32", "float64"):
@@ -97,7 +101,7 @@ class Accuracy(Recipe):
             raise ValueError(f"max_memory must be a positive number of bytes, got {self.max_memory:g}.")
         own: dict[str, Any] = {"max_memory": float(self.max_memory)}
         own |= {} if self.layers is None else {"layers": _count_or_distances(self.layers)}
-        own |= {} if self.psf_shape is None else {"psf_shape": (int(self.psf_shape[0]), int(self.psf_shape[1]))}
+        own |= {} if shape is None else {"psf_shape": (int(shape[0]), int(shape[1]))}
         vars(self).update(own)
 
     def settings(self) -> dict[str, Any]:
@@ -130,6 +134,10 @@ class Shortcuts(TypedDict, total=False):
     max_memory: float
     tile: int | None
     direct: bool
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
 
 
 def _count_or_distances(layers: int | Sequence[float] | Tensor) -> int | tuple[float, ...]:
