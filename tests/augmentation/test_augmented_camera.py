@@ -69,6 +69,7 @@ def test_is_the_planned_camera_with_the_drawn_distance_and_seed(channels: int, t
         assert (result[index] - expected[0]).abs().max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_depth_map_takes_the_place_of_the_distance() -> None:
     camera = small_camera()
     signal = photographs(2)
@@ -98,6 +99,7 @@ def test_is_within_the_tolerance_of_the_reference_physics(distance: float) -> No
     assert error < 0.02
 
 
+@pytest.mark.slow
 def test_it_plans_once_for_each_camera_and_size(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     plan = Camera.plan

@@ -422,6 +422,7 @@ def seam(picture: Tensor, tile: int) -> float:
     return max(found)
 
 
+@pytest.mark.slow
 def test_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the statistics of windows the steps across the borders of tiles are those of their neighbourhood."""
     stage, picture = painting_stage(), smooth_picture(260, 324)

@@ -299,6 +299,7 @@ def test_a_pinhole_on_large_pixels_needs_no_diffraction() -> None:
     assert "wavelengths" not in {row.effect for row in plan.decisions}
 
 
+@pytest.mark.slow
 def test_nothing_through_which_a_parameter_trains_is_left_out() -> None:
     lens = optics.Lens(
         optics.CircularAperture(nn.Parameter(torch.tensor(2 * mm, dtype=torch.float64))),

@@ -162,6 +162,7 @@ def test_it_stops_where_that_does_not_help() -> None:
         train(None, loss=spoiled({4}, once=False))
 
 
+@pytest.mark.slow
 def test_going_back_survives_a_resume(tmp_path: Path) -> None:
     with pytest.warns(StyleWarning):
         whole = train(None, loss=spoiled({4}, once=True))
@@ -188,6 +189,7 @@ def test_a_diverging_loss_goes_back(monkeypatch) -> None:
     assert trained.finished
 
 
+@pytest.mark.slow
 def test_the_content_weight_follows_its_aim(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("kcam.style.run.SETTLED", 2)
 
@@ -318,6 +320,7 @@ def test_recorded_is_what_the_sensor_sees_with_and_without_optics() -> None:
     assert (pair[0] - pair[1]).abs().max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_plan_is_frozen_and_kept(tmp_path: Path) -> None:
     trained = train(None, tolerance=0.02)
     assert trained.plan is not None
