@@ -102,7 +102,7 @@ def _ours(cls: type) -> bool:
 
 def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
     """Code, by identity, and data that instances have from classes: those of others must promise, see `Element`."""
-    code: list[Any] = [tuple(vars(cls).values()) for cls in kind.__mro__ if _ours(cls)]
+    code: list[Any] = [_members(cls) for cls in kind.__mro__ if _ours(cls)]
     data: list[Any] = []
     others = [cls for cls in kind.__mro__[:-1] if not _ours(cls)]
     if others and vars(kind).get("pure") is not True:
@@ -120,6 +120,12 @@ def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
             elif not name.startswith("__"):
                 data += [name, value]
     return code, data
+
+
+def _members(cls: type) -> tuple[Any, ...]:
+    """What a class of ours defines; not what Python writes beside it when asked: annotations, or names of slots."""
+    defined = vars(cls).items()
+    return tuple(value for name, value in defined if not name.startswith("__") or isinstance(value, _CODE))
 
 
 def _closed_over(function: types.FunctionType) -> list[Any]:

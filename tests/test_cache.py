@@ -7,8 +7,11 @@ alone, and a walk strings random ones together, looking at pictures and gradient
 from __future__ import annotations
 
 import copy
+import copyreg
+import inspect
 import io
 import pickle
+import pydoc
 import random
 import sys
 import threading
@@ -27,7 +30,7 @@ from torch.autograd import forward_ad
 from torch.nn.utils import parametrize
 
 from kcam import Camera, Context, Scene, optics, sensor
-from kcam.cache import Unknown, ValueCache, value_of
+from kcam.cache import Settings, Unknown, ValueCache, value_of
 from kcam.optics import accuracy as accuracy_module
 from kcam.optics.propagation.table import choose
 from kcam.optics.propagation.textbook import textbook_row
@@ -747,6 +750,18 @@ def test_a_copy_has_kept_nothing(copied: Callable[[Any], Any]) -> None:
     first = cache.get(1, lambda: torch.zeros(1))
     assert cache.get(1, lambda: torch.ones(1)) is first
     assert float(copied(cache).get(1, lambda: torch.ones(1))) == 1
+
+
+def test_looking_at_a_class_changes_nothing() -> None:
+    """Python writes into a class what it was asked for: `__annotations__`, and `__slotnames__` for a copy."""
+    camera = Camera.preset("phone")
+    before = Settings(camera)
+    classes = {cls for module in camera.modules() for cls in type(module).__mro__ if cls.__module__.startswith("kcam")}
+    for cls in classes:
+        for look in (pydoc.render_doc, inspect.getmembers, inspect.get_annotations, copyreg._slotnames):  # type: ignore[attr-defined]
+            look(cls)
+    assert any("__slotnames__" in vars(cls) for cls in classes)
+    assert Settings(camera) == before
 
 
 def test_other_defaults_of_torch_are_other_values() -> None:

@@ -14,6 +14,7 @@ from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.propagation.table import PHYSICS, choose
+from kcam.optics.source import is_count
 from kcam.units import check_distances
 
 COVERAGES = ("channel", "band")
@@ -85,11 +86,11 @@ class Accuracy(Recipe):
             raise ValueError(f"unknown coverage {self.coverage!r}; known: {', '.join(COVERAGES)}.")
         for name, of in (("bands", "wavelengths"), ("tile", "pixels"), ("rank", "factors")):
             value = getattr(self, name)
-            if value is not None and not _is_count(value):
+            if value is not None and not is_count(value):
                 raise ValueError(f"{name} must be a positive number of {of}, or None, got {value!r}.")
         shape = self.psf_shape
-        if shape is not None and not (isinstance(shape, Sequence) and len(shape) == 2 and all(map(_is_count, shape))):
-            fix = f" Use ({shape}, {shape})." if _is_count(shape) else ""
+        if shape is not None and not (isinstance(shape, Sequence) and len(shape) == 2 and all(map(is_count, shape))):
+            fix = f" Use ({shape}, {shape})." if is_count(shape) else ""
             raise ValueError(f"psf_shape must be two positive integers (H, W) in pixels, or None, got {shape!r}.{fix}")
         if self.kappa is not None and not self.kappa > 1:
             raise ValueError(f"kappa must be above 1 sample per fringe, got {self.kappa:g}. Its default is {KAPPA:g}.")
@@ -134,10 +135,6 @@ class Shortcuts(TypedDict, total=False):
     max_memory: float
     tile: int | None
     direct: bool
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
 
 
 def _count_or_distances(layers: int | Sequence[float] | Tensor) -> int | tuple[float, ...]:

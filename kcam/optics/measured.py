@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from kcam.inputs import as_values, describe
 from kcam.optics.elements.element import set_tensor
-from kcam.optics.numerics import bracketed
+from kcam.optics.numerics import linear_weights
 from kcam.optics.regions import field_shares
 from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.precision import full_precision
@@ -236,7 +236,7 @@ class MeasuredPSF(nn.Module):
 
     def _of_distances(self, vergences: Tensor) -> Tensor:
         nodes = (1 / self.distances).to(vergences.device)
-        return _linear(nodes, vergences.to(torch.float64))
+        return linear_weights(nodes, vergences.to(torch.float64))
 
     def _of_wavelengths(self, wavelengths: Tensor) -> Tensor:
         low, high = (float(bound) for bound in self.wavelengths.aminmax())
@@ -246,7 +246,7 @@ class MeasuredPSF(nn.Module):
                 f"these PSFs were measured from {low * 1e9:.4g} to {high * 1e9:.4g} nm, and the scene has "
                 f"{float(outside[0]) * 1e9:.4g} nm. Measure there, or cut the scene to wavelengths that were measured."
             )
-        return _linear(self.wavelengths, wavelengths.to(self.wavelengths))
+        return linear_weights(self.wavelengths, wavelengths.to(self.wavelengths))
 
     def _resampled(self, pixels: PixelGrid) -> Tensor:
         """(F, Z, L, h, w) on the pixels that are asked for."""
@@ -275,17 +275,6 @@ def _check_psfs(psfs: Tensor) -> None:
         )
     if not bool((values.sum((-2, -1)) > 0).all()):
         raise ValueError("psfs has one that is dark everywhere. Leave out what was not measured.")
-
-
-def _linear(nodes: Tensor, at: Tensor) -> Tensor:
-    """Weights (N, n) of linear interpolation between nodes in any order; the outermost hold on beyond."""
-    ordered, order = nodes.sort()
-    if len(nodes) == 1:
-        return torch.ones(len(at), 1, dtype=at.dtype, device=at.device)
-    low, share = bracketed(ordered, at.clamp(ordered[0], ordered[-1]))
-    weights = torch.zeros(len(at), len(nodes), dtype=at.dtype, device=at.device)
-    rows = torch.arange(len(at), device=at.device)
-    return weights.index_put((rows, order[low]), 1 - share).index_put((rows, order[low + 1]), share)
 
 
 def _centred(psfs: Tensor, n: int, *, dim: int) -> Tensor:

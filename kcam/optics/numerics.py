@@ -101,6 +101,17 @@ def bracketed(nodes: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
     return before, (at - low) / (high - low)
 
 
+def linear_weights(nodes: Tensor, at: Tensor) -> Tensor:
+    """Weights (N, n) of linear interpolation between nodes in any order; the outermost hold on beyond."""
+    ordered, order = nodes.sort()
+    if len(nodes) == 1:
+        return torch.ones(len(at), 1, dtype=at.dtype, device=at.device)
+    low, share = bracketed(ordered, at.clamp(ordered[0], ordered[-1]))
+    weights = torch.zeros(len(at), len(nodes), dtype=at.dtype, device=at.device)
+    rows = torch.arange(len(at), device=at.device)
+    return weights.index_put((rows, order[low]), 1 - share).index_put((rows, order[low + 1]), share)
+
+
 MOST_NODES = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
 
 

@@ -54,8 +54,8 @@ class PixelGrid:
 
     def __post_init__(self) -> None:
         shape, dtype = self.shape, self.dtype
-        if not isinstance(shape, Sequence) or len(shape) != 2 or not all(map(_is_count, shape)):
-            fix = f" Use shape=({shape}, {shape})." if _is_count(shape) else ""
+        if not isinstance(shape, Sequence) or len(shape) != 2 or not all(map(is_count, shape)):
+            fix = f" Use shape=({shape}, {shape})." if is_count(shape) else ""
             raise ValueError(f"shape must be two positive integers (H, W) in pixels, got {shape!r}.{fix}")
         if not 0 < self.fill_factor <= 1:
             raise ValueError(
@@ -72,8 +72,9 @@ class PixelGrid:
         return math.sqrt(self.fill_factor)
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, Integral) and int(value) >= 1
+def is_count(value: object) -> bool:
+    """Whether it is a whole number of 1 or more."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
 
 
 @dataclass(frozen=True)

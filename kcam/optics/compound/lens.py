@@ -14,15 +14,14 @@ from kcam.optics.compound import pupil
 from kcam.optics.compound.presets import preset_surfaces
 from kcam.optics.compound.surface import Surface
 from kcam.optics.compound.tracing import Rays, system_matrix, trace
-from kcam.optics.elements.element import set_scalar
+from kcam.optics.elements.element import check_numbers, place_sensor
 from kcam.optics.numerics import Scalar, float64, phasor, squared
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.pixels import Pixels
 from kcam.optics.source import PixelGrid
-from kcam.units import check_distances, check_pixel_pitch, check_positive, check_trained, wavelength_grid
+from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 _AIMING = 10  # steps of the secant that aims a chief ray
-_AIMED = 1e-9  # of the stop's semi-diameter
 
 
 @dataclass(frozen=True)
@@ -76,12 +75,7 @@ class CompoundLens(nn.Module):
             raise ValueError("the last surface has glass behind it, but the sensor stands in air: glass=None.")
         self.surfaces = nn.ModuleList(surfaces)  # type: ignore[assignment]
         self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
-        if focus_distance is not None and sensor_distance is None:
-            sensor_distance = self._focused(float(check_distances(focus_distance, name="focus_distance")))
-        elif focus_distance is not None or sensor_distance is None:
-            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
-        check_positive(sensor_distance, name="sensor_distance")
-        set_scalar(self, "sensor_distance", sensor_distance)
+        place_sensor(self, focus_distance, sensor_distance, image_distance=self._focused)
 
     @classmethod
     def preset(cls, name: str, *, focus_distance: float = math.inf, focus_wavelength: float = 550e-9) -> CompoundLens:
@@ -98,8 +92,7 @@ class CompoundLens(nn.Module):
 
     def check(self) -> None:
         """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
-        for name, value in (*self.named_parameters(), *self.named_buffers()):
-            check_trained(value, name=f"{name} of the lens")
+        check_numbers(self)
         for surface in self.surfaces:
             surface.check()
         check_positive(self.sensor_distance, name="sensor_distance")
@@ -160,12 +153,15 @@ class CompoundLens(nn.Module):
 
     # ---- exact rays ------------------------------------------------------------------------------------------------
 
-    def launch(self, heights: Tensor, vergences: Tensor, px: Tensor, py: Tensor) -> Rays:
+    def launch(
+        self, heights: Tensor, vergences: Tensor, px: Tensor, py: Tensor, *, entrance: Tensor | None = None
+    ) -> Rays:
         """Rays at the plane of the first vertex, from points at (0, heights) through (px, py) of the entrance pupil.
 
         Args: heights: Y / D. vergences: 1 / distance from the first vertex [1/m]. px, py: [m]; all broadcast.
+            entrance: where that pupil is [m], where it is known: see `first_order`.
         """
-        e = self.first_order().entrance_pupil.to(px.device)
+        e = (self.first_order().entrance_pupil if entrance is None else entrance).to(px.device)
         v = vergences / (1 + vergences * e)  # from the entrance pupil
         sx, sy = px * v, py * v - heights
         n = torch.rsqrt(1 + sx**2 + sy**2)
@@ -186,7 +182,12 @@ class CompoundLens(nn.Module):
         step = 1e-3 * first.entrance_semi_diameter.detach()
 
         def landed(px: Tensor, py: Tensor) -> Rays:
-            return trace(self.surfaces, self.launch(heights, vergences, px, py), indices, until=self.stop)
+            return trace(
+                self.surfaces,
+                self.launch(heights, vergences, px, py, entrance=first.entrance_pupil),
+                indices,
+                until=self.stop,
+            )
 
         shape = torch.broadcast_shapes(heights.shape, vergences.shape, *(index.shape for index in indices))
         zero = torch.zeros(shape, dtype=torch.float64, device=heights.device)
@@ -202,28 +203,22 @@ class CompoundLens(nn.Module):
             across = landed(zero + step, now).x / step
         return now - landed(zero, now).y / along, across, along
 
-    def _bundle(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> tuple[Rays, Rays]:
-        """The chief ray (F, Z, L, 1) and rays that overfill the stop (F, Z, L, R) at the sensor."""
-        device = heights.device
-        indices = [index.to(device)[None, None, :, None] for index in self.indices(wavelengths)]
+    def _nodes(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> _Nodes:
+        """Chief rays of heights (F,), vergences (Z,) and wavelengths (L,). Raises: ValueError where one is lost."""
+        indices = [index.to(heights.device)[None, None, :, None] for index in self.indices(wavelengths)]
         t, v = heights[:, None, None, None], vergences[None, :, None, None]
         aim, across, along = self.aimed(t, v, indices)
-        semi = float64(self.surfaces[self.stop].semi_diameter).detach()  # type: ignore[arg-type]
-        x, y = pupil.rays_over_stop(device)
-        px, py = x * (semi / across.abs()), aim + y * (semi / along.abs())
-        chief, bundle = (
-            self._to_sensor(trace(self.surfaces, self.launch(t, v, a, b), indices))
-            for a, b in ((torch.zeros_like(aim), aim), (px, py))
-        )
+        chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
         if not bool(chief.alive.all()):
             height = float(t.expand(chief.alive.shape)[~chief.alive].max())
             raise ValueError(
                 f"the chief ray of a point at {height:.3g} (Y / D) misses a surface or is totally reflected: the field "
                 "of this lens is smaller. Use smaller fields."
             )
-        return chief, bundle
+        return _Nodes(indices, t, v, aim, across, along, chief)
 
-    def _to_sensor(self, rays: Rays) -> Rays:
+    def _at_sensor(self, rays: Rays, indices: list[Tensor]) -> Rays:
+        rays = trace(self.surfaces, rays, indices)
         t = float64(self.sensor_distance).to(rays.x.device) / rays.dz
         return Rays(
             rays.x + t * rays.dx, rays.y + t * rays.dy, rays.dx, rays.dy, rays.path + t, rays.alive, rays.clearance
@@ -243,9 +238,8 @@ class CompoundLens(nn.Module):
         light comes late. Rays are aimed at the stop: S x S points of its bounding square, rows along +y.
         """
         asked = self._asked(wavelengths, distances, field)
-        indices = [index[None, None, :, None] for index in self.indices(asked.wavelengths)]
-        t, v = asked.heights[:, None, None, None], asked.vergences[None, :, None, None]
-        aim, across, along = self.aimed(t, v, indices)
+        nodes = self._nodes(asked.wavelengths, asked.vergences, asked.heights)
+        chief = nodes.chief
         semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
         side = torch.linspace(-1, 1, samples, dtype=torch.float64)
         x, y = (part.flatten() for part in torch.meshgrid(side, side, indexing="xy"))
@@ -253,14 +247,12 @@ class CompoundLens(nn.Module):
         cx, cy = (part[:, None, None, None] for part in asked.directions.unbind(1))
         to_x, to_y = semi * (x * cy - y * cx), semi * (x * cx + y * cy)
         with torch.no_grad():
-            px, py = to_x / across, aim + to_y / along
+            px, py = to_x / nodes.across, nodes.aim + to_y / nodes.along
             for _ in range(_AIMING):
-                at = trace(self.surfaces, self.launch(t, v, px, py), indices, until=self.stop)
-                px, py = px - (at.x - to_x) / across, py - (at.y - to_y) / along
-        chief, rays = (
-            self._to_sensor(trace(self.surfaces, self.launch(t, v, a, b), indices))
-            for a, b in ((torch.zeros_like(aim), aim), (px, py))
-        )
+                started = self.launch(nodes.heights, nodes.vergences, px, py)
+                at = trace(self.surfaces, started, nodes.indices, until=self.stop)
+                px, py = px - (at.x - to_x) / nodes.across, py - (at.y - to_y) / nodes.along
+        rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
         radius = float64(self.sensor_distance) - self.first_order().exit_pupil
         ox, oy = rays.x - chief.x, rays.y - chief.y
         onto = ox * rays.dx + oy * rays.dy
@@ -273,7 +265,12 @@ class CompoundLens(nn.Module):
 
     def pupils(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> pupil.PupilFit:
         """Pupils of F x Z x L nodes, in this order: heights (F,) >= 0, vergences (Z,) [1/m], wavelengths (L,) [m]."""
-        chief, rays = self._bundle(wavelengths, vergences, heights)
+        nodes = self._nodes(wavelengths, vergences, heights)
+        semi = float64(self.surfaces[self.stop].semi_diameter).detach()  # type: ignore[arg-type]
+        x, y = pupil.rays_over_stop(heights.device)
+        px, py = x * (semi / nodes.across.abs()), nodes.aim + y * (semi / nodes.along.abs())
+        chief = nodes.chief
+        rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
         wavefront = rays.path - rays.dx * rays.x - rays.dy * (rays.y - chief.y) - chief.path
         clearances = torch.stack(rays.clearance, dim=-2)
         flat = [part.flatten(0, 2) for part in (rays.dx, rays.dy, wavefront, clearances, rays.alive, chief.y[..., 0])]
@@ -286,7 +283,7 @@ class CompoundLens(nn.Module):
     ) -> Tensor:
         """Where each wavelength's chief ray lands on the sensor [m]: (F, Z, L, 2), without `field` (Z, L, 2)."""
         asked = self._asked(wavelengths, distances, field)
-        chief = self._bundle(asked.wavelengths, asked.vergences, asked.heights)[0].y[..., 0]
+        chief = self._nodes(asked.wavelengths, asked.vergences, asked.heights).chief.y[..., 0]
         found = chief[..., None] * asked.directions[:, None, None]
         return found if field is not None else found[0]
 
@@ -309,7 +306,7 @@ class CompoundLens(nn.Module):
         asked = self._asked([self.focus_wavelength if wavelength is None else wavelength], distance, field)
         near = 1e-4 * torch.ones(1, dtype=torch.float64)
         heights = torch.cat([near, asked.heights])
-        landed = self._bundle(asked.wavelengths, asked.vergences, heights)[0].y[:, 0, 0, 0]
+        landed = self._nodes(asked.wavelengths, asked.vergences, heights).chief.y[:, 0, 0, 0]
         ideal = landed[0] / near[0] * asked.heights
         return torch.where(asked.heights > 0, landed[1:] / torch.where(ideal == 0, 1.0, ideal) - 1, 0.0)
 
@@ -368,6 +365,22 @@ class _Asked:
     vergences: Tensor
     heights: Tensor
     directions: Tensor
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """What rays to F x Z x L nodes start from: heights, vergences and indices as they broadcast against rays (..., R);
+    where chief rays cross the entrance pupil, and how the stop follows it there: see `CompoundLens.aimed`; and the
+    chief rays at the sensor, (F, Z, L, 1).
+    """
+
+    indices: list[Tensor]
+    heights: Tensor
+    vergences: Tensor
+    aim: Tensor
+    across: Tensor
+    along: Tensor
+    chief: Rays
 
 
 _AREA_SAMPLES = 256

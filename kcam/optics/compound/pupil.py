@@ -139,5 +139,5 @@ def opening(clearances: Tensor, *, spacing: float) -> Tensor:
     for q in clearances:
         depth = q / (1 + torch.sqrt((1 - q).clamp(min=0)))
         slope = torch.stack(torch.gradient(depth, spacing=spacing)).square().sum(0).clamp(min=1e-18).sqrt()
-        passed = passed * edge_profile(depth / (spacing * slope.clamp(min=1e-9)))
+        passed = passed * edge_profile(depth / (spacing * slope))
     return passed

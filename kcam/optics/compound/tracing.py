@@ -38,7 +38,11 @@ class Rays:
     @property
     def dz(self) -> Tensor:
         """Direction cosine along the axis."""
-        return torch.sqrt((1 - self.dx**2 - self.dy**2).clamp(min=1e-12))
+        return _along(self.dx, self.dy)
+
+
+def _along(dx: Tensor, dy: Tensor) -> Tensor:
+    return torch.sqrt((1 - dx**2 - dy**2).clamp(min=1e-12))
 
 
 def trace(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], *, until: int | None = None) -> Rays:
@@ -55,7 +59,7 @@ def trace(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], *,
     z, clearance = torch.zeros_like(x), []
     last = len(surfaces) - 1
     for k, surface in enumerate(surfaces):
-        dz = torch.sqrt((1 - dx**2 - dy**2).clamp(min=1e-12))
+        dz = _along(dx, dy)
         t, hit = _met(surface, x, y, z, dx, dy, dz)
         x, y, z, path = x + t * dx, y + t * dy, z + t * dz, path + indices[k] * t
         r2 = x**2 + y**2
@@ -70,8 +74,7 @@ def trace(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], *,
         x, y, z, dx, dy = (torch.where(alive, v, torch.zeros_like(v)) for v in (x, y, z, dx, dy))
         if k < last:
             z = z - float64(surface.thickness).to(z.device)
-    dz = torch.sqrt((1 - dx**2 - dy**2).clamp(min=1e-12))
-    t = -z / dz
+    t = -z / _along(dx, dy)
     return Rays(x + t * dx, y + t * dy, dx, dy, path + indices[-1] * t, alive, tuple(clearance))
 
 

@@ -8,7 +8,7 @@ Pixel maps cannot be sampled like smooth paths; they come as `PixelMap` and pass
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from kcam.context import arguments_text
 from kcam.optics.numerics import Scalar
 from kcam.optics.pupil.coordinates import Pupil
 from kcam.optics.pupil.maps import PixelMap
+from kcam.units import check_distances, check_positive, check_trained
 
 Term = tuple[Tensor, Tensor]  # coefficients (L,), map over the pupil [the product is an OPD in metres]
 
@@ -30,6 +31,31 @@ def set_scalar(module: nn.Module, name: str, value: Scalar) -> None:
         module.register_buffer(name, value)
     else:
         setattr(module, name, float(value))
+
+
+def place_sensor(
+    lens: nn.Module,
+    focus_distance: float | None,
+    sensor_distance: Scalar | None,
+    *,
+    image_distance: Callable[[float], float],
+) -> None:
+    """Store the sensor's distance [m], as given or where `image_distance` has the image of a focus.
+
+    Raises: ValueError for both or neither, and what is no distance.
+    """
+    if focus_distance is not None and sensor_distance is None:
+        sensor_distance = image_distance(float(check_distances(focus_distance, name="focus_distance")))
+    elif focus_distance is not None or sensor_distance is None:
+        raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
+    check_positive(sensor_distance, name="sensor_distance")
+    set_scalar(lens, "sensor_distance", sensor_distance)
+
+
+def check_numbers(lens: nn.Module) -> None:
+    """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
+    for name, value in (*lens.named_parameters(), *lens.named_buffers()):
+        check_trained(value, name=f"{name} of the lens")
 
 
 class Element(nn.Module):

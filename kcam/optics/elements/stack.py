@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from kcam.optics.elements.apertures import Aperture, rim_per_area
 from kcam.optics.elements.diffractive import DOE
-from kcam.optics.elements.element import Element, set_scalar
+from kcam.optics.elements.element import Element, check_numbers, place_sensor
 from kcam.optics.elements.refractive import PlanoConvexLens
 from kcam.optics.numerics import Scalar, float64
 from kcam.optics.pupil.maps import PixelMap, pixel_under
-from kcam.units import check_distances, check_positive, check_trained, wavelength_grid
+from kcam.units import check_positive, wavelength_grid
 
 _FINE = 1024  # samples on each axis that an area is summed over
 _ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
@@ -46,12 +46,12 @@ class ElementStack(nn.Module):
             )
         self.elements = nn.ModuleList(elements)  # type: ignore[assignment]
         self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
-        if focus_distance is not None and sensor_distance is None:
-            sensor_distance = self._sensor_distance_for(float(check_distances(focus_distance, name="focus_distance")))
-        elif focus_distance is not None or sensor_distance is None:
-            raise ValueError("give either focus_distance= or sensor_distance= [m], not both and not neither.")
-        check_positive(sensor_distance, name="sensor_distance")
-        set_scalar(self, "sensor_distance", sensor_distance)
+        place_sensor(
+            self,
+            focus_distance=focus_distance,
+            sensor_distance=sensor_distance,
+            image_distance=self._sensor_distance_for,
+        )
         self._check_curvature()
 
     def configuration(self) -> dict[str, object]:
@@ -214,8 +214,7 @@ class ElementStack(nn.Module):
 
     def check(self) -> None:
         """What the constructors refuse must not come in by an optimiser's step or a loaded file either."""
-        for name, value in (*self.named_parameters(), *self.named_buffers()):
-            check_trained(value, name=f"{name} of the lens")
+        check_numbers(self)
         for element in self.elements:
             element.check()
         check_positive(self.sensor_distance, name="sensor_distance")

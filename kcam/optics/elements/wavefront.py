@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcam.inputs import describe
 from kcam.optics.elements.element import Element, Term, check_map, set_tensor
-from kcam.optics.numerics import bracketed
+from kcam.optics.numerics import linear_weights
 from kcam.optics.pupil.coordinates import Pupil
 from kcam.optics.pupil.maps import PixelMap
 from kcam.units import check_length, wavelength_grid
@@ -119,22 +119,17 @@ class MeasuredPupil(Element):
 
     def _shares(self, wavelengths: Tensor) -> Tensor:
         """Of each map in the path at each wavelength, (L, maps)."""
-        known = self.wavelengths
-        if known is None or (len(known) == 1 and bool(((wavelengths / known.to(wavelengths) - 1).abs() < _SAME).all())):
+        if self.wavelengths is None:
             return wavelengths.new_ones(len(wavelengths), 1)
-        order = known.argsort().to(wavelengths.device)
-        nodes = known.to(wavelengths)[order]
-        slack = _SAME * nodes[-1]
-        if bool(((wavelengths < nodes[0] - slack) | (wavelengths > nodes[-1] + slack)).any()):
-            low, high, first, last = (1e9 * float(v) for v in (*wavelengths.aminmax(), nodes[0], nodes[-1]))
+        known = self.wavelengths.to(wavelengths)
+        low, high, first, last = (float(bound) for grid in (wavelengths, known) for bound in grid.aminmax())
+        if low < first - _SAME * last or high > last * (1 + _SAME):
             raise ValueError(
-                f"the pupil was measured from {first:.4g} to {last:.4g} nm, and {low:.4g} to {high:.4g} nm are asked "
-                "for. Give the opd of more wavelengths, or wavelengths=None: one path for all."
+                f"the pupil was measured from {1e9 * first:.4g} to {1e9 * last:.4g} nm, and {1e9 * low:.4g} to "
+                f"{1e9 * high:.4g} nm are asked for. Give the opd of more wavelengths, or wavelengths=None: one path "
+                "for all."
             )
-        before, share = bracketed(nodes, wavelengths)
-        shares = wavelengths.new_zeros(len(wavelengths), len(nodes))
-        shares.scatter_(1, order[before][:, None], 1 - share[:, None])
-        return shares.scatter_add_(1, order[before + 1][:, None], share[:, None])
+        return linear_weights(known, wavelengths)
 
 
 def _filled(opd: Tensor, *, count: int | None) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcam.optics.numerics import Scalar
-from kcam.optics.pupil.rim import kaiser_sinc
+from kcam.optics.pupil.rim import kaiser_sinc, running_integral
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,7 @@ _MAP_BETA = 7.9  # 80 dB: passes 0.79 of the Nyquist frequency and stops from 1.
 @functools.lru_cache(maxsize=1)
 def _low_pass_integral() -> tuple[np.ndarray, np.ndarray]:
     """Running integral of the map low-pass, tabulated: (offsets in samples, integral from -inf)."""
-    offset = np.linspace(-_MAP_HALF_WIDTH, _MAP_HALF_WIDTH, 200 * 2 * _MAP_HALF_WIDTH + 1)
-    kernel = kaiser_sinc(offset, half_width=_MAP_HALF_WIDTH, beta=_MAP_BETA)
-    step = offset[1] - offset[0]
-    # Simpson-like correction of the trapezium: h^2/12 times the slope at the ends vanishes, the kernel is 0 there
-    integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)]) * step
-    return offset, integral / integral[-1]
+    return running_integral(_MAP_HALF_WIDTH, beta=_MAP_BETA, steps=200)
 
 
 @functools.lru_cache(maxsize=1)

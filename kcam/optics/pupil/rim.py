@@ -31,6 +31,15 @@ def kaiser_sinc(offset: np.ndarray, *, half_width: float, beta: float) -> np.nda
     return np.where(np.abs(offset) < half_width, np.sinc(offset) * np.i0(beta * np.sqrt(inside)) / np.i0(beta), 0.0)
 
 
+def running_integral(half_width: int, *, beta: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of a `kaiser_sinc` at so many steps for each sample: (offsets in samples, integral from -inf, up to 1)."""
+    offset = np.linspace(-half_width, half_width, steps * 2 * half_width + 1)
+    kernel = kaiser_sinc(offset, half_width=half_width, beta=beta)
+    # Simpson-like correction of the trapezium: h^2/12 times the slope at the ends vanishes, the kernel is 0 there
+    integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)]) * (offset[1] - offset[0])
+    return offset, integral / integral[-1]
+
+
 @functools.lru_cache(maxsize=1)
 def _edge_taps() -> np.ndarray:
     """The low-pass of edge weights, a tap for each fine cell; the outer taps undo the droop of the cell average."""
@@ -58,10 +67,7 @@ def edge_response(frequency: np.ndarray) -> np.ndarray:
 @torch.inference_mode(False)
 def _edge_integral() -> Tensor:
     """Of the low-pass, from far outside an edge to far inside, at _PROFILE_STEPS points for each sample."""
-    steps = np.arange(-_EDGE_HALF_WIDTH * _PROFILE_STEPS, _EDGE_HALF_WIDTH * _PROFILE_STEPS + 1) / _PROFILE_STEPS
-    kernel = kaiser_sinc(steps, half_width=_EDGE_HALF_WIDTH, beta=13.2)
-    integral = np.concatenate([[0.0], np.cumsum((kernel[1:] + kernel[:-1]) / 2)])
-    return torch.as_tensor(integral / integral[-1])
+    return torch.as_tensor(running_integral(_EDGE_HALF_WIDTH, beta=13.2, steps=_PROFILE_STEPS)[1])
 
 
 def edge_profile(distance: Tensor) -> Tensor:
