@@ -54,6 +54,8 @@ class Accuracy(Recipe):
         occlusion: False adds the layers up, also where a nearer one hides a farther one.
         coverage: where layers hide each other, count it per "channel" of the filter that is absorbed, or per "band":
             the colours at an edge are then exact, at the cost of the bands.
+        spacing: pixels between the places whose PSFs are computed, where they vary over the picture; None: as the
+            estimate on the scene asks, see `Imaging.explain`.
         rank: of the scene's spectra, at most, see `Scene.low_rank`; None for its own.
         precision: "float32" computes so whatever the scene's type; None for the scene's, or float64 where its light
             spans more than float32's transforms hold, see `rendering.rounding.wide_range`.
@@ -73,6 +75,7 @@ class Accuracy(Recipe):
     interpolate: bool = True
     occlusion: bool = True
     coverage: str = "channel"
+    spacing: int | None = None
     rank: int | None = None
     precision: str | None = None
     max_memory: float = 2e9
@@ -84,7 +87,7 @@ class Accuracy(Recipe):
             raise ValueError(f"unknown propagator {self.propagator!r}; known: {', '.join(PHYSICS)}.")
         if self.coverage not in COVERAGES:
             raise ValueError(f"unknown coverage {self.coverage!r}; known: {', '.join(COVERAGES)}.")
-        for name, of in (("bands", "wavelengths"), ("tile", "pixels"), ("rank", "factors")):
+        for name, of in (("bands", "wavelengths"), ("tile", "pixels"), ("rank", "factors"), ("spacing", "pixels")):
             value = getattr(self, name)
             if value is not None and not is_count(value):
                 raise ValueError(f"{name} must be a positive number of {of}, or None, got {value!r}.")
@@ -130,6 +133,7 @@ class Shortcuts(TypedDict, total=False):
     interpolate: bool
     occlusion: bool
     coverage: str
+    spacing: int | None
     rank: int | None
     precision: str | None
     max_memory: float

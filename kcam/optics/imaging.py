@@ -19,8 +19,9 @@ from torch import Tensor
 from kcam.cache import ValueCache, differentiated
 from kcam.context import Context, Curves, Stage
 from kcam.effects import Work
-from kcam.inputs import check_bands, describe
+from kcam.inputs import as_values, check_bands, describe
 from kcam.optics.accuracy import Accuracy, Recipe, Shortcuts
+from kcam.optics.field import FieldEstimate, FieldPicture
 from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.regions import field_shares, pixel_positions
@@ -28,7 +29,7 @@ from kcam.optics.rendering.borders import BORDERS
 from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, layer_shares, warn_of_few
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
-from kcam.optics.source import Defocus, PixelGrid, Points, PSFSource
+from kcam.optics.source import Defocus, FieldPSFs, FieldSource, PixelGrid, Points, PSFSource
 from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
@@ -44,6 +45,13 @@ class Absorber(Curves, Protocol):
         """What the filter makes of the channels' light (B, C, H, W)."""
 
 
+def _checked_centre(centre: tuple[float, float]) -> tuple[float, float]:
+    numbers = as_values(centre, name="centre", unit="m").reshape(-1)
+    if numbers.shape != (2,) or not bool((numbers.abs() < 1).all()):
+        raise ValueError(f"centre must be x and y of the picture on the sensor, less than 1 m, got {centre!r}. * mm?")
+    return float(numbers[0]), float(numbers[1])
+
+
 class Imaging(Stage):
     """The light of a scene through a lens onto the pixels.
 
@@ -54,6 +62,10 @@ class Imaging(Stage):
         integrate: the light over each pixel; False takes point samples at the pixels' centres instead.
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
         distance: of a plain tensor [m]; None: where the lens is focused.
+        field: whether the PSF varies over the picture, with distortion, lateral colour and vignetting; None: with a
+            `CompoundLens`. False: every pixel sees the PSF of the axis.
+        centre: of the picture, x and y on the sensor from the axis [m], as light falls: a sensor that is cropped or
+            shifted.
         accuracy: what is computed and what is left out, an `Accuracy`; shortcuts: its arguments one by one, over those.
             Each is an attribute of the stage too, and may be set.
     Raises: ValueError for an unknown border, a pitch or distance not in metres, and what `Accuracy` refuses.
@@ -68,6 +80,8 @@ class Imaging(Stage):
         integrate: bool = True,
         border: str = "reflect",
         distance: float | None = None,
+        field: bool | None = None,
+        centre: tuple[float, float] = (0.0, 0.0),
         accuracy: Accuracy = _DEFAULT,
         **shortcuts: Unpack[Shortcuts],
     ) -> None:
@@ -86,6 +100,9 @@ class Imaging(Stage):
         self.lens = lens
         self.pixel_pitch, self.fill_factor = check_pixel_pitch(pixel_pitch), fill_factor
         self.integrate, self.border, self.distance = integrate, border, distance
+        if field and not isinstance(lens, FieldSource):
+            raise ValueError(f"a {type(lens).__name__} has one PSF, that on the axis: leave out field=True.")
+        self.field, self.centre = field, _checked_centre(centre)
         if not isinstance(accuracy, Accuracy):
             raise TypeError(f"accuracy must be an optics.Accuracy, got {describe(accuracy)}. Use Accuracy(bands=12).")
         self.accuracy = replace(accuracy, **shortcuts)
@@ -106,7 +123,7 @@ class Imaging(Stage):
 
     def configuration(self) -> dict[str, Any]:
         """Constructor arguments, for saving: those of the accuracy one by one."""
-        names = ("lens", "pixel_pitch", "fill_factor", "integrate", "border", "distance")
+        names = ("lens", "pixel_pitch", "fill_factor", "integrate", "border", "distance", "field", "centre")
         return {name: getattr(self, name) for name in names} | self.accuracy.settings()
 
     def changed(self, **arguments: Any) -> Imaging:
@@ -166,7 +183,11 @@ class Imaging(Stage):
             return 1, 1
         if self.accuracy.psf_shape is not None:
             return self.accuracy.psf_shape
-        window = self.lens.window(Points(vergences), wavelengths, self.pixels((1, 1), torch.empty(0)))
+        pixels = self.pixels((1, 1), torch.empty(0))
+        if self.varies:
+            window = self._over_field(picture, vergences, wavelengths).window(pixels)
+        else:
+            window = self.lens.window(Points(vergences), wavelengths, pixels)
         height, width = (min(side, n + (n + 1) % 2) for side, n in zip(window, picture, strict=True))
         return height, width
 
@@ -376,6 +397,9 @@ class Imaging(Stage):
         if shares is not None and self.accuracy.per_band:
             weights, afterwards = None, weights
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
+        if self.varies:
+            field = self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes)
+            return self._finished(field.light(planes, shares), weights, afterwards)
         length = self._layers_at_once(bands, window, planes)
         light = planes.new_zeros(())
         for position, own in self._zones(planes):
@@ -386,9 +410,64 @@ class Imaging(Stage):
                 renderer = Renderer(psfs, spectra=spectra, weights=weights, **self._rendering(scene))
                 layers.add(renderer, first=start)
             light = layers.light if position is None else light + layers.light
+        return self._finished(light, weights, afterwards)
+
+    def _finished(self, light: Tensor, weights: Tensor | None, afterwards: Tensor | None) -> Tensor:
         if afterwards is not None:
             light, weights = torch.einsum("cl,blyx->bcyx", afterwards, light), afterwards
         return not_negative(light, weights)
+
+    # ---- over the field --------------------------------------------------------------------------------------------
+
+    @property
+    def varies(self) -> bool:
+        """Whether the PSF varies over the picture."""
+        return isinstance(self.lens, FieldSource) and self.field is not False and self.accuracy.blur
+
+    def _over_field(
+        self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
+    ) -> FieldPSFs:
+        """PSFs of all places of a picture."""
+        assert isinstance(self.lens, FieldSource)
+        half = (self.pixel_pitch * n / 2 for n in picture[::-1])
+        corner = math.hypot(*(abs(c) + side for c, side in zip(self.centre, half, strict=True)))
+        return self.lens.over_field(corner, vergences, self._psf_wavelengths(wavelengths), mixing=mixing)
+
+    def _field_picture(
+        self, scene: Scene, *, vergences: Tensor, window: tuple[int, int], weights: Tensor | None, like: Tensor
+    ) -> FieldPicture:
+        picture = (scene.shape[-2], scene.shape[-1])
+        spectra = None if scene.spectra is None else scene.spectra.to(like)
+        rendering = self._rendering(scene) | {"border": "zero", "cache": None, "weights": weights, "spectra": spectra}
+        mixing = None
+        if weights is not None:
+            shape = Renderer(like.new_empty(1, len(self._psf_wavelengths(scene.wavelengths)), 1, 1), **rendering)
+            mixing = shape.mixing().detach().flatten(0, 1)
+        psfs = self._over_field(picture, vergences, scene.wavelengths, mixing=mixing)
+
+        def render(bank: Tensor, planes: Tensor, shares: Tensor | None, *, occlusion: bool | None = None) -> Tensor:
+            own = rendering | {"picture": (planes.shape[-2], planes.shape[-1])}
+            layers = Layers(planes, shares, occlusion=self.accuracy.occlusion if occlusion is None else occlusion)
+            layers.add(Renderer(bank, **own), first=0)
+            return layers.light
+
+        pixels, spacing = self.pixels(window, like), self.accuracy.spacing
+        whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
+        return FieldPicture(psfs, pixels, self.centre, render, self.border, spacing, whole)
+
+    def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
+        """What a picture over the field will be off by; as it is with `forward`'s arguments. Raises: ValueError for
+        optics whose PSF does not vary.
+        """
+        if not self.varies:
+            raise ValueError("every pixel of this picture sees one PSF: ask lens.explain() what that is off by.")
+        planes = self.working(scene)
+        weights = None if colour_filter is None else colour_filter.contraction(scene.wavelengths).to(planes)
+        vergences, shares = self.layers_of(scene, planes)
+        picture = (planes.shape[-2], planes.shape[-1])
+        window = self.psf_window(scene.wavelengths, vergences=vergences, picture=picture)
+        field = self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes)
+        return field.explain(planes, shares)
 
     def _zones(self, planes: Tensor) -> Iterator[tuple[Tensor | None, Tensor]]:
         """Positions on the sensor (1, 2) [m] at which the optics know their PSFs, and what of the light falls there."""

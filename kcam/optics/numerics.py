@@ -112,6 +112,14 @@ def linear_weights(nodes: Tensor, at: Tensor) -> Tensor:
     return weights.index_put((rows, order[low]), 1 - share).index_put((rows, order[low + 1]), share)
 
 
+def chebyshev(v: Tensor, degree: int) -> Tensor:
+    """T_0 .. T_degree of values, (degree + 1, ...)."""
+    terms = [torch.ones_like(v), v]
+    while len(terms) <= degree:
+        terms.append(2 * v * terms[-1] - terms[-2])
+    return torch.stack(terms[: degree + 1])
+
+
 MOST_NODES = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
 
 

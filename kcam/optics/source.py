@@ -20,6 +20,7 @@ from torch import Tensor
 from kcam.context import Photometric
 
 _CPU = torch.device("cpu")
+OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 
 
 @dataclass(frozen=True)
@@ -121,3 +122,34 @@ class PSFSource(Photometric, Protocol):
 
     def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
         """How far light is spread, for a planner."""
+
+
+class FieldPSFs(Protocol):
+    """PSFs over the sensor, of points at some vergences (Z,) and wavelengths (L,)."""
+
+    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False) -> Tensor:
+        """PSFs (F, Z, L, h, w) of what the chief ray of the focus brings to places (F, 2) [m], as light falls; relative
+        to the light of a point on the axis. The window's middle is that place. whole: light outside is put back.
+        """
+
+    def window(self, pixels: PixelGrid) -> tuple[int, int]:
+        """The window (h, w) that holds all but 0.5 % of the light of any place; `pixels.shape` does not count."""
+
+    def undistorted(self, places: Tensor) -> Tensor:
+        """Where a lens without distortion would bring what falls at places (..., 2) [m]."""
+
+    def deviations(self, pixels: PixelGrid) -> dict[str, float]:
+        """What PSFs may be off by, of their light: pupils, colours, sampling, outside; see `field.FieldEstimate`."""
+
+
+@runtime_checkable
+class FieldSource(PSFSource, Protocol):
+    """Optics whose PSF varies over the sensor, computed for any place."""
+
+    def over_field(
+        self, reach: float, vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
+    ) -> FieldPSFs:
+        """For places up to `reach` from the axis [m], points at vergences (Z,) [1/m], wavelengths (L,) [m].
+
+        mixing: weights (M, L) of what the picture adds up, from which follows how closely wavelengths are told apart.
+        """

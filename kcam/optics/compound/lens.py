@@ -11,14 +11,16 @@ from torch import Tensor, nn
 
 from kcam.inputs import as_values
 from kcam.optics.compound import pupil
+from kcam.optics.compound.distortion import NODES, ImageHeights
+from kcam.optics.compound.field import FieldPSFs, bank
+from kcam.optics.compound.images import Frame, areas
 from kcam.optics.compound.presets import preset_surfaces
 from kcam.optics.compound.surface import Surface
+from kcam.optics.compound.table import tabulate
 from kcam.optics.compound.tracing import Rays, system_matrix, trace
 from kcam.optics.elements.element import check_numbers, place_sensor
-from kcam.optics.numerics import Scalar, float64, phasor, squared
-from kcam.optics.propagation import sampling
-from kcam.optics.propagation.pixels import Pixels
-from kcam.optics.source import PixelGrid
+from kcam.optics.numerics import Scalar, float64
+from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 _AIMING = 10  # steps of the secant that aims a chief ray
@@ -298,8 +300,9 @@ class CompoundLens(nn.Module):
         asked = self._asked([self.focus_wavelength] if wavelengths is None else wavelengths, distances, field)
         heights = torch.cat([asked.heights.new_zeros(1), asked.heights])
         fitted = self.pupils(asked.wavelengths, asked.vergences, heights)
-        areas = torch.stack([_area(fitted, node) for node in range(len(fitted.centre))]).view(len(heights), -1)
-        return (areas[1:] / areas[:1]).mean(1)
+        found = areas(fitted, Frame.of(fitted, heights.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2)))
+        found = found.view(len(heights), -1)
+        return (found[1:] / found[:1]).mean(1)
 
     def distortion(self, field: Tensor, *, wavelength: float | None = None, distance: float = math.inf) -> Tensor:
         """Height of the chief ray's image over that of a lens without distortion, less 1, (F,)."""
@@ -329,21 +332,116 @@ class CompoundLens(nn.Module):
         """
         asked = self._asked(wavelengths, distances, field)
         pixels = PixelGrid(check_pixel_pitch(pixel_pitch), shape, integrate=integrate, dtype=dtype)
-        grid = wavelength_grid([*asked.wavelengths.tolist(), self.focus_wavelength])
         heights = torch.cat([asked.heights, asked.heights.new_zeros(1)])
-        fitted = self.pupils(grid, asked.vergences, heights)
-        node = torch.arange(len(fitted.centre)).view(len(heights), len(asked.vergences), len(grid))
-        area = {index: _area(fitted, index) for index in node[..., :-1].flatten().tolist()}
-        bank = []
-        for f, direction in enumerate(asked.directions):
-            for z in range(len(asked.vergences)):
-                for k, wavelength in enumerate(asked.wavelengths.tolist()):
-                    own, axis, middle = int(node[f, z, k]), int(node[-1, z, k]), int(node[f, z, -1])
-                    offset = fitted.chief[own] - fitted.chief[middle]
-                    image = _image(fitted, own, wavelength, direction, offset, pixels)
-                    bank.append(image * (area[own] / area[axis]).to(dtype))
-        found = torch.stack(bank).view(len(asked.heights), len(asked.vergences), -1, *pixels.shape)
+        fitted = self.pupils(asked.wavelengths, asked.vergences, heights)
+        middle = self._nodes(wavelength_grid([self.focus_wavelength]), asked.vergences, heights).chief.y[..., 0]
+        chief = fitted.chief.view(len(heights), len(asked.vergences), -1)
+        found = bank(fitted, asked.wavelengths, asked.directions, (chief - middle)[:-1], pixels)
         return found if field is not None else found[0]
+
+    # ---- as a source of PSFs ---------------------------------------------------------------------------------------
+
+    @property
+    def focus_distance(self) -> float:
+        """Object distance from the first vertex that is imaged onto the sensor paraxially [m]; inf for beyond."""
+        vergence = float(self._focus().detach())
+        return 1 / vergence if vergence > 1e-9 else math.inf
+
+    def _focus(self, wavelength: float | None = None) -> Tensor:
+        """Vergence of what the sensor is focused on [1/m]; 0 where that lies beyond infinity."""
+        indices = [index[0] for index in self.indices(wavelength_grid([wavelength or self.focus_wavelength]))]
+        (a, b), (c, d) = system_matrix(self.surfaces, indices)
+        away = float64(self.sensor_distance)
+        return (-(a + away * c) / (b + away * d)).clamp(min=0)
+
+    @property
+    def image_scale(self) -> Tensor:
+        """Height of the image of a point near the axis over the point's own (Y / D) [m]."""
+        first = self.first_order()
+        away = float64(self.sensor_distance) - first.exit_pupil
+        return away * first.entrance_semi_diameter / first.exit_semi_diameter
+
+    def aperture_area(self) -> float:
+        """The pupil's area in direction cosines times the squared sensor distance [m^2]: as exposure takes it."""
+        with torch.no_grad():
+            zero = torch.zeros(1, dtype=torch.float64)
+            fitted = self.pupils(wavelength_grid([self.focus_wavelength]), zero + self._focus(), zero)
+            area = areas(fitted, Frame.of(fitted, torch.tensor([[0.0, 1.0]], dtype=torch.float64)))
+        return float(area) * float(self.sensor_distance) ** 2
+
+    def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
+        """PSFs (N, L, h, w) of source points, on the axis unless they have positions: see `PSFSource`."""
+        places = torch.zeros(len(points.vergences), 2) if points.positions is None else points.positions
+        places = places.to(torch.float64)
+        field = self.over_field(float(places.norm(dim=1).max()), points.vergences, wavelengths)
+        if points.positions is None:
+            return field.bank(places[:1], pixels)[0]
+        found = field.bank(places, pixels)
+        return found[torch.arange(len(places)), torch.arange(len(places))]
+
+    def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
+        """The window that holds all but 0.1 % of the light of points on the axis: see `PSFSource`."""
+        reach = 0.0 if points.positions is None else float(points.positions.norm(dim=1).max())
+        return self.over_field(reach, points.vergences, wavelengths).window(pixels)
+
+    def defocus_waves(self, wavelengths: Tensor) -> float:
+        """a^2 / (2 lambda) at the shortest wavelength, of the entrance pupil."""
+        return float(self.first_order().entrance_semi_diameter.detach()) ** 2 / (2 * float(wavelengths.min()))
+
+    def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
+        """How far light is spread on the axis, for a planner: by its rays in focus, and by a cone out of focus."""
+        with torch.no_grad():
+            ends = torch.stack(list(wavelengths.aminmax())).to(torch.float64)
+            focus = [float(self._focus(float(end))) for end in ends]
+            spread = float(self.first_order().entrance_semi_diameter * self.image_scale) / pixel_pitch
+            middle = torch.tensor([sum(focus) / 2], dtype=torch.float64)
+            side = self.over_field(0.0, middle, ends).blur()
+        airy = 0.61 * float(ends.max()) * 2 * self.f_number
+        return Defocus((min(focus), max(focus)), spread, (side + airy) / pixel_pitch)
+
+    def image_heights(self, reach: float) -> ImageHeights:
+        """How images lie on the sensor, up to `reach` from the axis [m]: by chief rays of the focus.
+
+        Raises: ValueError for a sensor that reaches beyond the field of the lens.
+        """
+        grid, focus = wavelength_grid([self.focus_wavelength]), self._focus()[None]
+        scale = self.image_scale
+
+        def landed(heights: Tensor) -> Tensor:
+            return -self._nodes(grid, focus, heights).chief.y[:, 0, 0, 0]
+
+        with torch.no_grad():
+            highest = reach / scale
+            try:
+                for _ in range(_AIMING):  # the image of the highest point lies at the sensor's corner
+                    highest = highest * reach / landed(highest[None])[0]
+                highest = 1.005 * highest
+                landed(highest[None])
+            except ValueError as error:
+                raise ValueError(
+                    f"the sensor reaches {reach * 1e3:.3g} mm from the axis, beyond the field of this lens: {error}"
+                ) from error
+            angles = (torch.arange(NODES, dtype=torch.float64) + 0.5) * (math.pi / (2 * NODES))
+        heights = highest * torch.cos(angles)
+        return ImageHeights.through(heights, landed(heights), scale)
+
+    def over_field(
+        self, reach: float, vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
+    ) -> FieldPSFs:
+        """PSFs of all places up to `reach` from the axis [m], for points at vergences (Z,) [1/m] and wavelengths (L,)
+        [m]; mixing: see `source.FieldSource`.
+        """
+        self.check()
+        heights = self.image_heights(max(reach, 1e-9))
+        square = torch.tensor(reach, dtype=torch.float64) ** 2
+        highest = reach * float(heights.over_radius(square).detach())
+        table = tabulate(
+            lambda t, v, colours: self.pupils(colours, v, t),
+            highest=highest,
+            vergences=vergences.to(torch.float64),
+            wavelengths=wavelengths.to(torch.float64),
+        )
+        return FieldPSFs(table, heights, vergences.to(torch.float64), wavelengths.to(torch.float64), reach, mixing)
 
     def _asked(self, wavelengths: Tensor | list[float], distances: Tensor | float, field: Tensor | None) -> _Asked:
         self.check()
@@ -381,59 +479,3 @@ class _Nodes:
     across: Tensor
     along: Tensor
     chief: Rays
-
-
-_AREA_SAMPLES = 256
-
-
-def _grid(fitted: pupil.PupilFit, node: int, direction: Tensor, count: int) -> tuple[Tensor, float, Tensor, Tensor]:
-    """Nodes (N,) about the middle of a pupil, their spacing, and the meridional dx, dy of the grid on sensor axes."""
-    spacing = 2 * _half(fitted, node) / (count - 12)  # beyond the edge there is room for its low-pass
-    nodes = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) * spacing
-    middle = (fitted.middle[node] * direction / spacing).round() * spacing
-    x, y = middle[0] + nodes[None, :], middle[1] + nodes[:, None]
-    return nodes, spacing, x * direction[1] - y * direction[0], x * direction[0] + y * direction[1]
-
-
-def _half(fitted: pupil.PupilFit, node: int) -> float:
-    """Half the width of a grid over a pupil [direction cosine], in steps: it does not follow small changes."""
-    return 2 ** (math.ceil(16 * math.log2(float(fitted.reach[node])) + 0.5) / 16)
-
-
-def _area(fitted: pupil.PupilFit, node: int) -> Tensor:
-    """Of the open pupil in direction cosines."""
-    _, spacing, dx, dy = _grid(fitted, node, torch.tensor([0.0, 1.0], dtype=torch.float64), _AREA_SAMPLES)
-    return pupil.opening(fitted.at(node, dx, dy)[1], spacing=spacing).sum() * spacing**2
-
-
-def _image(
-    fitted: pupil.PupilFit, node: int, wavelength: float, direction: Tensor, offset: Tensor, pixels: PixelGrid
-) -> Tensor:
-    """PSF of one node on the pixels, relative to what passes its pupil, (h, w); offset: of its chief ray [m]."""
-    half = _half(fitted, node)
-    _, coarse, dx, dy = _grid(fitted, node, direction, 65)
-    with torch.no_grad():
-        path, q = fitted.at(node, dx, dy)
-        slope = torch.stack(torch.gradient(path, spacing=coarse)).square().sum(0).sqrt()
-        spread = float(torch.where((q > 0).all(0), slope, 0.0).max()) + abs(float(offset))
-    margin = max(pixels.shape) // 2 + (sampling.WINDOW_MARGIN if pixels.integrate else 0)
-    scale = {"semi_aperture": half, "sensor_distance": 1.0, "wavelength": wavelength}
-    count = sampling.pupil_samples(**scale, half_window=margin * pixels.pitch, displacement=spread)
-    if count > sampling.MAX_PUPIL_SAMPLES:
-        raise ValueError(
-            f"this PSF needs {count} pupil samples (blur {spread * 1e3:.3g} mm), more than "
-            f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape or a distance nearer to the focus."
-        )
-    nodes, spacing, dx, dy = _grid(fitted, node, direction, count)
-    path, q = fitted.at(node, dx, dy)
-    passed = pupil.opening(q, spacing=spacing)
-    wavenumber = 2 * math.pi / wavelength
-    field = phasor(wavenumber * path) * passed
-    per_pixel = sampling.points_per_pixel(pixel_pitch=pixels.pitch, **scale) if pixels.integrate else 1.0
-    reach = math.ceil(per_pixel * margin)
-    points = torch.arange(-reach, reach + 1, dtype=torch.float64) * (pixels.pitch / per_pixel)
-    rows, columns = (phasor(wavenumber * (points - offset * along)[:, None] * nodes) for along in direction.flip(0))
-    complex_dtype = pixels.dtype.to_complex()
-    image = squared(rows.to(complex_dtype) @ field.to(complex_dtype) @ columns.to(complex_dtype).T)
-    factor = (spacing * pixels.pitch / wavelength) ** 2 / passed.sum()
-    return Pixels(pixels.shape, per_pixel, integrate=pixels.integrate).of_image(image) * factor.to(pixels.dtype)

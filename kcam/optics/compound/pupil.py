@@ -1,6 +1,6 @@
 """The pupil of a real lens, seen from one point of the image: wavefront and clearances over direction cosines.
 
-    W(dx, dy) = sum_ij w_ij T_2i(u) T_j(v),   q_s(dx, dy) likewise,   u = dx / a, v = (dy - m_0) / b
+    W(dx, dy) = sum_ij w_ij T_2i(u) T_j(v),   q_s(dx, dy) likewise,   u = dx / r, v = (dy - c) / r
 
 fitted to exact rays. In the direction cosines towards the sensor the Fourier kernel is straight at every field angle,
 and a uniform radiance is uniform, so that illumination is an area. Light passes where every clearance q is above 0.
@@ -8,12 +8,14 @@ and a uniform radiance is uniform, so that illumination is an area. Light passes
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from kcam.optics.numerics import chebyshev
 from kcam.optics.pupil.rim import edge_profile
 
 DEGREES = (12, 16, 20)
@@ -29,34 +31,41 @@ _RINGS, _SPOKES = 21, 49
 class PupilFit:
     """Pupils of N nodes as polynomials.
 
-    degree: of the polynomials. centre (N,), half_width (N, 2): of the direction cosine dy, of dx and dy, in which they
-    are. middle, reach (N,): dy of the middle of what is open, and half the square around that. wavefront: coefficients
-    (N, T) [m]. clearances: (N, S, T). chief: where the chief ray lands, (N,) [m]. residual: rms of the fit of the
-    wavefront within the open part, (N,) [m].
+    degree: of the polynomials. centre (N,), half_width (N, 2): of the direction cosine dy, of dx and dy, within which
+    there are rays; r is the larger. wavefront: coefficients (N, T) [m]. clearances: (N, S, T). chief: where the chief
+    ray lands, (N,) [m]. residual: rms of the fit of the wavefront within the open part, (N,) [m].
     """
 
     degree: int
     centre: Tensor
     half_width: Tensor
-    middle: Tensor
-    reach: Tensor
     wavefront: Tensor
     clearances: Tensor
     chief: Tensor
     residual: Tensor
 
-    def at(self, node: int, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
-        """Wavefront (...) [m] and clearances (S, ...) at direction cosines of one node's meridional plane."""
-        a, b = self.half_width[node]
-        along, across = _chebyshev(dx / a, self.degree)[::2], _chebyshev((dy - self.centre[node]) / b, self.degree)
-        table = torch.cat([self.wavefront[node][None], self.clearances[node]])
-        full = table.new_zeros(len(table), self.degree + 1, self.degree // 2 + 1)
+    @property
+    def radius(self) -> Tensor:
+        """r (N,)."""
+        return self.half_width.amax(1)
+
+    def at(self, node: int | Tensor, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
+        """Wavefront (...) [m] and clearances (S + 1, ...) at direction cosines of one node's meridional plane; of nodes
+        (n,) at dx, dy (n, ...): (n, ...) and (n, S + 1, ...).
+        """
+        if isinstance(node, int):
+            wavefront, clearances = self.at(torch.tensor([node]), dx[None], dy[None])
+            return wavefront[0], clearances[0]
+        shape = (-1, *[1] * (dx.ndim - 1))
+        r, off = self.radius[node].view(shape), dy - self.centre[node].view(shape)
+        across, along = chebyshev(dx / r, self.degree)[::2], chebyshev(off / r, self.degree)
         rows, columns = _orders(self.degree)
-        full[:, rows, columns] = table
-        values = torch.einsum("sji,j...,i...->s...", full, across, along)
+        table = torch.cat([self.wavefront[node][:, None], self.clearances[node]], dim=1)
+        values = torch.einsum("nst,tn...->ns...", table, along[rows] * across[columns])
         # beyond the rays nothing is known, and nothing open
-        inside = 1 - (dx / a) ** 2 - ((dy - self.centre[node]) / b) ** 2
-        return values[0], torch.cat([values[1:], inside[None]])
+        a, b = (part.view(shape) for part in self.half_width[node].unbind(1))
+        inside = 1 - (dx / a) ** 2 - (off / b) ** 2
+        return values[:, 0], torch.cat([values[:, 1:], inside[:, None]], dim=1)
 
 
 def rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor]:
@@ -68,6 +77,7 @@ def rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor]:
     return x.flatten().clamp(min=0), y.flatten()
 
 
+@functools.cache
 def _orders(degree: int) -> tuple[Tensor, Tensor]:
     """Order in v, and half the order in u, of each term."""
     pairs = [(j, i) for i in range(degree // 2 + 1) for j in range(degree + 1 - 2 * i)]
@@ -75,16 +85,20 @@ def _orders(degree: int) -> tuple[Tensor, Tensor]:
     return torch.tensor(rows), torch.tensor(columns)
 
 
-def _chebyshev(v: Tensor, degree: int) -> Tensor:
-    """T_0 .. T_degree of values, (degree + 1, ...)."""
-    terms = [torch.ones_like(v), v]
-    while len(terms) <= degree:
-        terms.append(2 * v * terms[-1] - terms[-2])
-    return torch.stack(terms)
+def odd_terms(degree: int) -> Tensor:
+    """Which terms change their sign with dy, (T,): they are odd in the height of the point too."""
+    return _orders(degree)[0] % 2 == 1
 
 
 def fit(
-    dx: Tensor, dy: Tensor, wavefront: Tensor, clearances: Tensor, alive: Tensor, chief: Tensor, *, enough: float
+    dx: Tensor,
+    dy: Tensor,
+    wavefront: Tensor,
+    clearances: Tensor,
+    alive: Tensor,
+    chief: Tensor,
+    *,
+    enough: float,
 ) -> PupilFit:
     """Least squares over rays (N, R); clearances (N, S, R). enough: residual of the wavefront [m].
 
@@ -101,43 +115,34 @@ def fit(
                 "Is the field too wide, or a semi_diameter too small?"
             )
         weights = torch.exp(_LESS * least.clamp(max=0)).clamp(min=1e-3) * alive
-        limits = [_extent(part, where) for where in (alive, least > -0.03) for part in (dx.abs(), dy)]
-        half = torch.stack([limits[0][1], (limits[1][1] - limits[1][0]) / 2], dim=1).clamp(min=1e-9)
-        centre = (limits[1][1] + limits[1][0]) / 2
-        middle = (limits[3][1] + limits[3][0]) / 2
-        reach = torch.maximum(limits[2][1], (limits[3][1] - limits[3][0]) / 2)
+        low, high = torch.where(alive, dy, math.inf).amin(1), torch.where(alive, dy, -math.inf).amax(1)
+        half = torch.stack([torch.where(alive, dx.abs(), 0.0).amax(1), (high - low) / 2], dim=1).clamp(min=1e-9)
+        centre, radius = (low + high) / 2, half.amax(1, keepdim=True)
         others = least[:, None].expand_as(clearances)  # surfaces that clip nothing that the rest lets pass are left out
         clips = ((clearances <= others + 1e-12) & (others < 0.02) & (others > -0.3)).any(0).any(1)
     clearances = clearances[:, clips]
     for degree in DEGREES:
         rows, columns = _orders(degree)
-        u, v = dx / half[:, :1], (dy - centre[:, None]) / half[:, 1:]
-        terms = (_chebyshev(v, degree)[rows] * _chebyshev(u, degree)[::2][columns]).movedim(0, -1)
+        u, v = dx / radius, (dy - centre[:, None]) / radius
+        terms = (chebyshev(v, degree)[rows] * chebyshev(u, degree)[::2][columns]).movedim(0, -1)
         data = torch.cat([wavefront[:, None], clearances], dim=1).mT
         q, r = torch.linalg.qr(terms * weights[..., None])
         found = torch.linalg.solve_triangular(r, q.mT @ (data * weights[..., None]), upper=True)  # (N, T, 1 + S)
         with torch.no_grad():
             off = (terms @ found[..., :1])[..., 0] - data[..., 0]
             residual = ((off**2 * (least > 0)).sum(1) / passed).sqrt()
-        fitted = PupilFit(degree, centre, half, middle, reach, found[..., 0], found[..., 1:].mT, chief, residual)
+        fitted = PupilFit(degree, centre, half, found[..., 0], found[..., 1:].mT, chief, residual)
         if float(residual.max()) <= enough:
             break
     return fitted
 
 
-def _extent(values: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and largest of some values in each row."""
-    return torch.where(where, values, math.inf).amin(1), torch.where(where, values, -math.inf).amax(1)
-
-
-def opening(clearances: Tensor, *, spacing: float) -> Tensor:
-    """Quadrature weights of what passes at the points of a grid, (A, B): 1 inside, 0 outside, and low-passed between.
+def opening(clearances: Tensor) -> Tensor:
+    """Quadrature weights of what passes at the points of grids, (N, S, A, B) -> (N, A, B): 1 inside, 0 outside, and
+    low-passed between.
 
     An edge is straight as far as the low-pass reaches, some samples; 1 - sqrt(1 - q) is nearly the distance from it.
     """
-    passed = torch.ones_like(clearances[0])
-    for q in clearances:
-        depth = q / (1 + torch.sqrt((1 - q).clamp(min=0)))
-        slope = torch.stack(torch.gradient(depth, spacing=spacing)).square().sum(0).clamp(min=1e-18).sqrt()
-        passed = passed * edge_profile(depth / (spacing * slope))
-    return passed
+    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=0)))
+    slope = functools.reduce(torch.add, (part.square() for part in torch.gradient(depth, dim=(-2, -1))))
+    return functools.reduce(torch.mul, edge_profile(depth * slope.clamp(min=1e-18).rsqrt()).unbind(1))

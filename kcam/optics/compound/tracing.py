@@ -16,6 +16,7 @@ from kcam.optics.compound.surface import Surface
 from kcam.optics.numerics import float64
 
 _ITERATIONS = 12  # of Newton's method; a sphere hit at half its radius is exact after five
+_CLOSE = 1e-9  # m: after one more of Newton's steps, which squares what is off, nothing is
 _HIT = 1e-12  # m: farther from the surface a ray has missed it
 
 
@@ -94,6 +95,8 @@ def _met(
         for _ in range(_ITERATIONS):
             away, steepness = residual(t)
             t = t - away / steepness
+            if not bool((away.abs() > _CLOSE).any()):
+                break
         t = torch.where(t.isfinite(), t, 0.0)
     away, steepness = residual(t)
     return t - away / steepness.detach(), away.detach().abs() < _HIT

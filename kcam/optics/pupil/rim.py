@@ -71,11 +71,14 @@ def _edge_integral() -> Tensor:
 
 
 def edge_profile(distance: Tensor) -> Tensor:
-    """Weight of a sample so far inside a straight edge [samples], float64: the low-passed step, 0 outside, 1 inside."""
-    table = _edge_integral().to(distance.device)
-    position = ((distance + _EDGE_HALF_WIDTH) * _PROFILE_STEPS).clamp(0, len(table) - 1.001)
-    low = position.detach().long()
-    return table[low] + (position - low) * (table[low + 1] - table[low])
+    """Weight of a sample so far inside a straight edge [samples]: the low-passed step, 0 outside and 1 inside."""
+    table = _edge_integral().to(distance)
+    near = (distance.detach().abs() < _EDGE_HALF_WIDTH).flatten().nonzero()[:, 0]  # few of a pupil's samples
+    position = (distance.flatten()[near] + _EDGE_HALF_WIDTH) * _PROFILE_STEPS
+    low = position.detach().long().clamp(max=len(table) - 2)
+    weights = table[low] + (position - low) * (table[low + 1] - table[low])
+    far = (distance.detach() > 0).to(distance.dtype).flatten()
+    return far.index_put((near,), weights).view(distance.shape)
 
 
 @functools.lru_cache(maxsize=64)

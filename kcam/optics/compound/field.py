@@ -1,0 +1,184 @@
+"""The PSFs of a real lens at places of its sensor: what a picture with it asks for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from kcam.optics.compound.distortion import ImageHeights
+from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, images
+from kcam.optics.compound.pupil import PupilFit
+from kcam.optics.compound.table import PupilTable, lagrange_weights
+from kcam.optics.source import PixelGrid
+
+_LOOKED = 9  # heights at which a window is asked for
+_COLOURS = (5, 7, 10, 14, 20)  # wavelengths at which PSFs are computed
+COLOUR_ERROR = 1e-2
+OUTSIDE = 5e-3
+"""Share of the light that the default window may leave out; it is put back into the window, see `Imaging`."""
+_HALVINGS = 30
+
+
+def bank(
+    fitted: PupilFit,
+    wavelengths: Tensor,
+    directions: Tensor,
+    moved: Tensor,
+    pixels: PixelGrid,
+    *,
+    how: Closeness = CLOSE,
+    whole: bool = False,
+) -> Tensor:
+    """PSFs (F, Z, L, h, w) of F places, moved (F, Z, L) [m] along their directions (F, 2) on the sensor.
+
+    fitted: of F + 1 x Z x L pupils; those on the axis come last, and their light counts as 1.
+    """
+    places, vergences, count = moved.shape
+    towards = directions.repeat_interleave(vergences * count, dim=0)
+    frame = Frame.of(fitted, torch.cat([towards, towards.new_tensor([[0.0, 1.0]]).expand(vergences * count, 2)]))
+    own, axis = torch.arange(len(frame.half)).split([len(towards), vergences * count])
+    light = areas(fitted, frame, axis).repeat(places)
+    colours = wavelengths.repeat(places * vergences)
+    offsets = moved.flatten()[:, None] * towards
+    found = images(fitted, frame[own], colours, offsets, pixels, relative_to=light, how=how, whole=whole)
+    return found.view(places, vergences, count, *pixels.shape)
+
+
+@dataclass(frozen=True)
+class FieldPSFs:
+    """PSFs of places of the sensor, for some vergences (Z,) [1/m] and wavelengths (L,) [m]."""
+
+    table: PupilTable
+    image_heights: ImageHeights
+    vergences: Tensor
+    wavelengths: Tensor
+    reach: float  # of places, from the axis [m]
+    mixing: Tensor | None = None  # (M, L): what a picture adds up of the wavelengths' PSFs; None: each is seen
+
+    kept: dict[PixelGrid, tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
+
+    def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
+        """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
+        heights = torch.cat([radii * self.image_heights.over_radius(radii**2), radii.new_zeros(1)])
+        grid = torch.meshgrid(heights, self.vergences, wavelengths, indexing="ij")
+        return self.table.at(*(part.flatten() for part in grid))
+
+    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False) -> Tensor:
+        """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
+        of a point on the axis. whole: what leaves the window is put back into it.
+
+        Places that mirror each other share their PSF; of many wavelengths the PSFs' pixels are polynomials through
+        those of a few (`colours`).
+        """
+        height, width = pixels.shape
+        odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
+        own, which = (places.abs() / (1e-6 * pixels.pitch)).round().unique(dim=0, return_inverse=True)
+        nodes, shares, _ = self.colours(pixels)
+        psfs = self._bank(own * (1e-6 * pixels.pitch), nodes, odd, whole=whole)
+        if len(nodes) < len(self.wavelengths):
+            psfs = torch.einsum("ln,fznhw->fzlhw", shares.to(psfs), psfs)
+        mirrored = [
+            psf.flip([axis for axis, side in ((-1, x), (-2, y)) if side < 0])
+            for psf, (x, y) in zip(psfs[which], places.tolist(), strict=True)
+        ]
+        return torch.stack(mirrored)[..., :height, :width]
+
+    def _bank(self, places: Tensor, wavelengths: Tensor, pixels: PixelGrid, *, whole: bool = False) -> Tensor:
+        radii = places.norm(dim=1)
+        away = radii.clamp(min=1e-150)[:, None]
+        towards = torch.where(radii[:, None] > 0, places / away, places.new_tensor([0.0, 1.0]))
+        fitted = self._fitted(radii, wavelengths)
+        chief = fitted.chief.view(len(places) + 1, len(self.vergences), -1)[:-1]
+        # what is above the axis falls below it: heights of chief rays count along the object's direction
+        moved = chief + radii[:, None, None]
+        return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
+
+    def colours(self, pixels: PixelGrid) -> tuple[Tensor, Tensor, float]:
+        """Wavelengths (n,) at which PSFs are computed, and what each gives to those that are asked for, (L, n): as few
+        as leave `COLOUR_ERROR` of the light in what the picture adds up of them; and what these leave.
+        """
+        if pixels not in self.kept:
+            self.kept[pixels] = self._few(pixels)
+        return self.kept[pixels]
+
+    @torch.no_grad()
+    def _few(self, pixels: PixelGrid) -> tuple[Tensor, Tensor, float]:
+        every = torch.eye(len(self.wavelengths), dtype=torch.float64)
+        if len(self.wavelengths) <= _COLOURS[0]:
+            return self.wavelengths, every, 0.0
+        places = torch.tensor([[0.0, 0.0], [0.42, 0.56]], dtype=torch.float64) * self.reach
+        mixing = every if self.mixing is None else self.mixing.double()
+        mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
+        truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), self._bank(places, self.wavelengths, pixels))
+        low, high = self.wavelengths.aminmax()
+        for n in _COLOURS:
+            if n >= len(self.wavelengths):
+                break
+            turned = torch.cos(math.pi * (torch.arange(n, dtype=torch.float64) + 0.5) / n)
+            nodes = (low + high) / 2 + (high - low) / 2 * turned
+            shares = lagrange_weights(nodes, self.wavelengths)
+            found = torch.einsum("mn,fznhw->fzmhw", (mixing @ shares).to(truth), self._bank(places, nodes, pixels))
+            off = float((found - truth).abs().sum((-2, -1)).max())
+            if off < COLOUR_ERROR:
+                return nodes, shares, off
+        return self.wavelengths, every, 0.0
+
+    @torch.no_grad()
+    def deviations(self, pixels: PixelGrid) -> dict[str, float]:
+        """What PSFs may be off by, of their light: see `field.FieldEstimate`."""
+        places = torch.tensor([[0.0, 0.0], [0.54, 0.72]], dtype=torch.float64) * self.reach
+        psfs = self.bank(places, pixels)
+        radii = places.norm(dim=1)
+        fitted = self._fitted(radii, self.wavelengths)
+        frame = Frame.of(fitted, radii.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2))
+        light = areas(fitted, frame).view(3, len(self.vergences), -1)
+        lost = 1 - psfs.sum((-2, -1)).double() / (light[:2] / light[2:])
+        pupils = self.table.deviation + 2 * math.pi * float(
+            (fitted.residual.view(-1, len(self.wavelengths)) / self.wavelengths).max()
+        )
+        return {
+            "pupils": pupils,
+            "colours": self.colours(pixels)[2],
+            "sampling": QUICK_ERROR,
+            "outside": float(lost.max().clamp(min=0)),
+        }
+
+    def undistorted(self, places: Tensor) -> Tensor:
+        """Where a lens without distortion would bring what falls at places (..., 2) [m]."""
+        return places * (self.image_heights.scale * self.image_heights.over_radius(places.square().sum(-1)))[..., None]
+
+    @torch.no_grad()
+    def blur(self) -> float:
+        """How far rays fall from where they should, at most, over all heights in the table [m]."""
+        return float(self._spread()[0].max())
+
+    @torch.no_grad()
+    def window(self, pixels: PixelGrid) -> tuple[int, int]:
+        """The window that holds all but `OUTSIDE` of the light of any height in the table.
+
+        A rim of length P around an area A sends the share lambda d P / (2 pi^2 A r) beyond a radius r, see
+        `Lens.window`; of each ray that falls x from the middle, what lies beyond r - x.
+        """
+        slopes, area = self._spread()
+        colours = self.wavelengths.repeat(len(slopes) // len(self.wavelengths))
+        # the rim of an area is that of a disc at least: 2 sqrt(pi area)
+        tail = (colours * (math.pi / area).sqrt() / math.pi**2)[:, None]
+        low, high = slopes.new_zeros(len(slopes), 1), slopes.amax(1, keepdim=True) + tail / OUTSIDE
+        for _ in range(_HALVINGS):
+            radius = (low + high) / 2
+            left = (radius - slopes).clamp(min=1e-12)
+            beyond = (tail / left).clamp(max=1).mean(1, keepdim=True)
+            low, high = torch.where(beyond > OUTSIDE, radius, low), torch.where(beyond > OUTSIDE, high, radius)
+        side = 2 * math.ceil(float(high.max()) / pixels.pitch) + 1
+        return side, side
+
+    def _spread(self) -> tuple[Tensor, Tensor]:
+        """How far shares of the light of some nodes fall from where they should [m], and the areas of their pupils."""
+        radii = torch.linspace(0, self.reach, _LOOKED if self.reach else 1, dtype=torch.float64)
+        fitted = self._fitted(radii, self.wavelengths)
+        frame = Frame.of(fitted, radii.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2))
+        own = torch.cat([radii, radii.new_zeros(1)]).repeat_interleave(len(self.vergences) * len(self.wavelengths))
+        return frame.slopes + (fitted.chief + own).abs()[:, None], areas(fitted, frame)

@@ -1,0 +1,220 @@
+"""From pupils to PSFs: many points of the field at once, each with its own grid over what is open.
+
+    h(x, y) = |sum_jk P(dx_j, dy_k) exp(i k (W(dx_j, dy_k) + x dx_j + y dy_k))|^2
+
+for all x and y by one FFT. Grids lie along the sensor's axes, and the pupil is turned: pixels never are. A polynomial
+of degree d is known from (d + 1)^2 Chebyshev points of the grid's square, wherever it is turned to, and a matrix for
+each axis takes it from there to all nodes.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.interpolate import BarycentricInterpolator
+from torch import Tensor
+
+from kcam.optics.compound.pupil import PupilFit, opening
+from kcam.optics.numerics import fast_length, phasor, squared
+from kcam.optics.propagation import sampling
+from kcam.optics.propagation.pixels import Pixels
+from kcam.optics.source import PixelGrid
+
+_SHARES = 100  # of the light, of which it is known how far they fall
+_LOOK = 41  # points across a pupil, to see what of it is open
+_ROOM = 12  # samples of a grid beyond what is open, for the low-pass of its edge
+_ACROSS = 52  # samples across what is open, at least: its edge is spread over twelve
+_AREA_SAMPLES = 128
+_AT_ONCE = 2**20  # points of pupils, or of images, that are held together
+
+
+@dataclass(frozen=True)
+class Closeness:
+    """How finely a PSF is sampled. kappa: see `sampling.pupil_samples`. margin: pixels evaluated beyond the window."""
+
+    kappa: float = sampling.KAPPA
+    margin: int = sampling.WINDOW_MARGIN
+
+
+CLOSE = Closeness()
+QUICK = Closeness(kappa=2.0, margin=2)
+"""Takes half of the time, and is at most `QUICK_ERROR` of a PSF's light from `CLOSE` (L1)."""
+QUICK_ERROR = 1e-3  # measured: at most 8e-4, Cooke triplet and EF50 at f/4
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where N pupils are open, by squares along the sensor's axes; no derivative passes through it.
+
+    directions (N, 2): from the axis to the image, on the sensor. middle (N, 2), half (N,): of the squares, in direction
+    cosines. slope (N,): how far the wavefront sends light from the chief ray's image, at most [m]. slopes (N, Q): of
+    equal shares of the light, ascending.
+    """
+
+    directions: Tensor
+    middle: Tensor
+    half: Tensor
+    slope: Tensor
+    slopes: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, fitted: PupilFit, directions: Tensor) -> Frame:
+        """Seen on a coarse grid. Raises: ValueError for a pupil that nothing passes."""
+        nodes = torch.arange(len(fitted.centre), device=fitted.centre.device)
+        parts = [_looked(fitted, own, directions[own]) for own in nodes.split(max(1, _AT_ONCE // (8 * _LOOK**2)))]
+        return cls(directions, *(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def __getitem__(self, index: Tensor) -> Frame:
+        own = (part[index] for part in (self.directions, self.middle, self.half, self.slope, self.slopes))
+        return Frame(*own)
+
+
+def _looked(fitted: PupilFit, nodes: Tensor, directions: Tensor) -> tuple[Tensor, ...]:
+    side = torch.linspace(-1, 1, _LOOK, dtype=torch.float64, device=directions.device)
+    r, centre = fitted.radius[nodes, None, None], fitted.centre[nodes, None, None]
+    dx, dy = torch.broadcast_tensors(r * side, centre + r * side[:, None])
+    path, clearances = fitted.at(nodes, dx, dy)
+    passes = (clearances > 0).all(1)
+    if not bool(passes.flatten(1).any(1).all()):
+        raise ValueError("a point's light is stopped completely. Use smaller fields, or larger semi-diameters.")
+    step = r * (2 / (_LOOK - 1))
+    slope = torch.stack(torch.gradient(path, dim=(-2, -1))).square().sum(0).sqrt() / step
+    ordered = torch.where(passes, slope, math.inf).flatten(1).sort(dim=1).values
+    count = passes.flatten(1).sum(1, keepdim=True)
+    rank = ((torch.arange(_SHARES) + 0.5) / _SHARES * count).long()  # each of as many of the rays that pass
+    slopes, slope = ordered.gather(1, rank), ordered.gather(1, count - 1)[:, 0]
+    x, y = (part[:, None, None] for part in directions.unbind(1))
+    place = torch.stack([dx * y + dy * x, dy * y - dx * x])  # on the sensor's axes: `_meridional` undone
+    low = torch.where(passes, place, math.inf).flatten(2).amin(2)
+    high = torch.where(passes, place, -math.inf).flatten(2).amax(2)
+    half = ((high - low).amax(0) / 2 + step[:, 0, 0]).clamp(max=1.5 * fitted.radius[nodes])
+    half = 2 ** (torch.ceil(16 * torch.log2(half) + 0.5) / 16)  # in steps: it does not follow small changes
+    grain = half / 16
+    return (((low + high).T / 2) / grain[:, None]).round() * grain[:, None], half, slope, slopes
+
+
+def _meridional(x: Tensor, y: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Direction cosines along the sensor's axes (n, ...), in the plane of the chief ray."""
+    cx, cy = (part.view(-1, *[1] * (x.ndim - 1)) for part in directions.unbind(1))
+    return x * cy - y * cx, x * cx + y * cy
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _from_chebyshev(degree: int, count: int) -> tuple[Tensor, Tensor]:
+    """Chebyshev points of (-1, 1), and what takes a polynomial's values there to `count` nodes: (count, degree + 1)."""
+    points = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    nodes = (np.arange(count) + 0.5) * 2 / count - 1
+    matrix = BarycentricInterpolator(points, np.eye(degree + 1))(nodes)
+    return torch.as_tensor(points), torch.as_tensor(matrix)
+
+
+def _known(
+    fitted: PupilFit, nodes: Tensor, frame: Frame, reach: Tensor, offsets: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Wavefronts (n, G, G) [m], rows along +y, and clearances (n, S, G, G) at the Chebyshev points of squares; reach:
+    of these (n,), from the middle of their frames. offsets (n, 2) [m]: of what is to be seen in the image's middle.
+    """
+    points = _from_chebyshev(fitted.degree, 1)[0].to(reach.device)
+    x, y = (frame.middle[:, k, None] + reach[:, None] * points for k in (0, 1))
+    x, y = torch.broadcast_tensors(x[:, None, :], y[:, :, None])
+    path, clearances = fitted.at(nodes, *_meridional(x, y, frame.directions))
+    if offsets is not None:
+        path = path - offsets[:, 0, None, None] * x - offsets[:, 1, None, None] * y
+    return path, clearances
+
+
+def areas(fitted: PupilFit, frame: Frame, nodes: Tensor | None = None) -> Tensor:
+    """Of the open pupils in direction cosines: of all, or of those with an index in `nodes` (n,)."""
+    found = []
+    every = torch.arange(len(frame.half)) if nodes is None else nodes
+    for nodes in every.split(max(1, _AT_ONCE // _AREA_SAMPLES**2)):
+        own = frame[nodes]
+        spacing = 2 * own.half / (_AREA_SAMPLES - _ROOM)
+        _, clearances = _known(fitted, nodes, own, spacing * (_AREA_SAMPLES / 2))
+        matrix = _from_chebyshev(fitted.degree, _AREA_SAMPLES)[1].to(spacing.device)
+        found.append(opening(matrix @ clearances @ matrix.mT).sum((-2, -1)) * spacing**2)
+    return torch.cat(found)
+
+
+def images(
+    fitted: PupilFit,
+    frame: Frame,
+    wavelengths: Tensor,
+    offsets: Tensor,
+    pixels: PixelGrid,
+    *,
+    relative_to: Tensor,
+    how: Closeness = CLOSE,
+    whole: bool = False,
+) -> Tensor:
+    """PSFs (N, h, w) of nodes at wavelengths (N,), each moved by (N, 2) [m]; 1 is the light of an area in direction
+    cosines, (N,). whole: what leaves the window is put back into it.
+
+    The field at points p / q apart is one FFT of length F: of a pupil sampled at lambda q / (p F). Its rows that are
+    dark, and columns that nobody asks for, are left out.
+    Raises: ValueError for blur that needs more than `sampling.MAX_PUPIL_SAMPLES`.
+    """
+    margin = max(pixels.shape) // 2 + how.margin
+    reach = margin + (frame.slope + offsets.detach().abs().amax(1)) / pixels.pitch
+    alike: dict[tuple[int, float], list[int]] = defaultdict(list)
+    for index, (half, far, wavelength) in enumerate(
+        zip(frame.half.tolist(), reach.tolist(), wavelengths.tolist(), strict=True)
+    ):
+        per_pixel = sampling.points_per_pixel(
+            pixel_pitch=pixels.pitch, semi_aperture=half, sensor_distance=1.0, wavelength=wavelength
+        )
+        if not pixels.integrate:
+            per_pixel = float(math.ceil(per_pixel))  # of which one is taken
+        fewest = math.ceil(_ACROSS * wavelength * per_pixel / (2 * half * pixels.pitch))
+        wanted = math.ceil(how.kappa * far * per_pixel)
+        length = fast_length(max(wanted, fewest, 2 * math.ceil(per_pixel * margin) + 1))
+        if length > sampling.MAX_PUPIL_SAMPLES:
+            raise ValueError(
+                f"this PSF needs {length} pupil samples (blur {far * pixels.pitch * 1e3:.3g} mm), more than "
+                f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape or a distance nearer to the focus."
+            )
+        alike[length, per_pixel].append(index)
+    found, order = [], []
+    for (length, per_pixel), indices in alike.items():
+        group = torch.tensor(indices)
+        own, colours = frame[group], wavelengths[group]
+        spacing = colours * (per_pixel / (pixels.pitch * length))
+        count = min(length, 2 * math.ceil(float((own.half / spacing).max())) + _ROOM)
+        known = _known(fitted, group, own, spacing * (count / 2), offsets[group])
+        phases = known[0] * (2 * math.pi / colours)[:, None, None]
+        matrix = _from_chebyshev(fitted.degree, count)[1].to(spacing.device)
+        points, low = math.ceil(per_pixel * margin), matrix.to(pixels.dtype)
+        weight = spacing**2 / relative_to[group]
+        for part in torch.arange(len(group)).split(max(1, _AT_ONCE // length**2)):
+            phase = (matrix @ phases[part] @ matrix.mT).remainder_(2 * math.pi).to(pixels.dtype)
+            passed = opening(low @ known[1][part].to(pixels.dtype) @ low.mT)
+            field = phasor(phase) * passed
+            image = squared(_middle(_middle(field, length, points).mT, length, points).mT)
+            if not pixels.integrate:
+                image = _every(image, int(per_pixel))
+            light = Pixels(pixels.shape, per_pixel, integrate=pixels.integrate).of_image(image)
+            factor = weight[part] * (spacing[part] * pixels.pitch / colours[part]) ** 2
+            if whole:
+                factor = weight[part] * passed.sum((-2, -1)) / light.sum((-2, -1))
+            found.append(light * factor[:, None, None].to(pixels.dtype))
+        order += indices
+    return torch.cat(found)[torch.tensor(order).argsort()]
+
+
+def _middle(field: Tensor, length: int, reach: int) -> Tensor:
+    """Spectrum (..., A, 2 reach + 1) of rows (..., A, B) at the frequencies about 0."""
+    spectrum = torch.fft.ifft(field, n=length, norm="forward")
+    return torch.cat([spectrum[..., length - reach :], spectrum[..., : reach + 1]], dim=-1)
+
+
+def _every(image: Tensor, step: int) -> Tensor:
+    """Points of an image (..., 2K + 1, 2K + 1) in steps from its middle."""
+    first = (image.shape[-1] // 2) % step
+    return image[..., first::step, first::step]
