@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from kcam.inputs import as_values
 from kcam.optics.compound import pupil
+from kcam.optics.compound.files import read_lens, write_lens
 from kcam.optics.compound.presets import preset_surfaces
 from kcam.optics.compound.surface import Surface
 from kcam.optics.compound.tracing import Rays, system_matrix, trace
@@ -81,6 +83,27 @@ class CompoundLens(nn.Module):
     def preset(cls, name: str, *, focus_distance: float = math.inf, focus_wavelength: float = 550e-9) -> CompoundLens:
         """A lens from its patent: a name in `presets.PRESETS`. Raises: ValueError for an unknown one."""
         return cls(*preset_surfaces(name), focus_distance=focus_distance, focus_wavelength=focus_wavelength)
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str], *, focus_distance: float | None = None) -> CompoundLens:
+        """A lens from sequential Zemax text (.zmx) or Optiland's JSON (.json), its primary wavelength that of focus.
+
+        focus_distance: as of the constructor; None leaves the sensor where the file has the image. Raises: as
+        `files.read_lens`: FileNotFoundError; ValueError that names the line or surface that kcam cannot be.
+        """
+        found = read_lens(path, focused=focus_distance is not None)
+        distance = found.sensor_distance if focus_distance is None else None
+        return cls(
+            *found.surfaces,
+            focus_distance=focus_distance,
+            sensor_distance=distance,
+            focus_wavelength=found.focus_wavelength,
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the lens as .zmx or .json, parameters by their values. Raises: ValueError, as `files.write_lens`."""
+        self.check()
+        write_lens(path, self.surfaces, sensor_distance=self.sensor_distance, focus_wavelength=self.focus_wavelength)
 
     def configuration(self) -> dict[str, object]:
         """Constructor arguments, for saving: the sensor's distance, which was set once, rather than the focus."""
