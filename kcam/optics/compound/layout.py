@@ -103,6 +103,12 @@ def asphere_arguments(coefficients: dict[int, float]) -> dict[str, object]:
     return found
 
 
+def refusal(name: str, place: str, reason: str) -> ValueError:
+    """What is wrong with a file of this name, and at which place in it."""
+    end = "" if reason.endswith(("?", ".")) else "."
+    return ValueError(f"{name}{place and ', '}{place}: {reason}{end}")
+
+
 @dataclass(frozen=True)
 class Found:
     """A surface in a file: its arguments, and the words that name its place in an error."""
@@ -118,8 +124,9 @@ def build(
     aperture: Aperture | None,
     focus_wavelength: float,
     error: Callable[[str, str], ValueError],
-) -> list[Surface]:
-    """The surfaces, with the stop's semi-diameter: the smaller one of its own and of what fills the aperture.
+) -> Layout:
+    """The lens, the last surface's thickness the sensor's distance, and the stop's semi-diameter the smaller one of its
+    own and of what fills the aperture.
 
     error: makes the exception from a place and a reason. Raises: what it makes, for a surface that cannot be, and a
         stop without a size.
@@ -131,6 +138,8 @@ def build(
         except (ValueError, TypeError) as reason:
             raise error(item.place, str(reason)) from None
 
+    distance = found[-1].arguments["thickness"]
+    found = [*found[:-1], Found(found[-1].arguments | {"thickness": 0.0}, found[-1].place)]
     surfaces = [made(item, stop=False) for item in found]
     own = found[stop].arguments["semi_diameter"]
     if aperture is not None:
@@ -143,7 +152,7 @@ def build(
         raise error(found[stop].place, "the stop has no semi-diameter, and the file no aperture that gives it one")
     resized = Found(found[stop].arguments | {"semi_diameter": own}, found[stop].place)
     surfaces[stop] = made(resized, stop=True)
-    return surfaces
+    return Layout(surfaces, distance, focus_wavelength)
 
 
 def _stop_of(surfaces: Sequence[Surface], stop: int, aperture: Aperture, wavelength: float) -> float:

@@ -51,7 +51,7 @@ class _Reader:
         raise self.error(self.place, reason)
 
     def error(self, place: str, reason: str) -> ValueError:
-        return ValueError(f"{self.name}{place and ', '}{place}: {reason.rstrip('.')}.")
+        return layout.refusal(self.name, place, reason)
 
     def value(self, held: dict[str, Any], key: str, default: float | None = None) -> float:
         try:
@@ -67,6 +67,12 @@ class _Reader:
         if math.isinf(found):
             self.wrong(f"{key!r} is {found}, expected a finite number")
         return found
+
+    def word(self, held: dict[str, Any], key: str, default: str | None = None) -> str:
+        found = held.get(key, default)
+        if not isinstance(found, str):
+            self.wrong(f"{key!r} is {str(found)[:40]!r}, expected a word")
+        return found[:40]
 
     def part(self, held: dict[str, Any], key: str) -> dict[str, Any]:
         found = held.get(key)
@@ -95,12 +101,11 @@ class _Reader:
             self.place = f"surface {len(items)}"
             self.wrong("glass stands in front of the image, but the sensor stands in air")
         self.place = f"surface {len(found) - 1}"
-        if self.part(found[-1], "geometry").get("type") not in ("Plane", "StandardGeometry"):
+        if self.part(found[-1], "geometry").get("type") not in ["Plane", "StandardGeometry"]:
             self.wrong("the image is not plane")
         if math.isfinite(self.value(self.part(found[-1], "geometry"), "radius", math.inf)):
             self.wrong("the image is not plane")
-        surfaces = layout.build(items, stop=stops[0], aperture=aperture, focus_wavelength=wavelength, error=self.error)
-        return Layout(surfaces, items[-1].arguments["thickness"], wavelength)
+        return layout.build(items, stop=stops[0], aperture=aperture, focus_wavelength=wavelength, error=self.error)
 
     # ---- of the whole lens -----------------------------------------------------------------------------------------
 
@@ -108,18 +113,19 @@ class _Reader:
         primary = [wave for wave in found if wave.get("is_primary") is True] or found[:1]
         if not primary:
             return layout.DEFAULT_WAVELENGTH
-        scale = {"nm": -9, "um": -6, "mm": -3, "cm": -2, "m": 0}.get(str(primary[0].get("unit", "um")))
+        unit = self.word(primary[0], "unit", "um")
+        scale = {"nm": -9, "um": -6, "mm": -3, "cm": -2, "m": 0}.get(unit)
         if scale is None:
-            self.wrong(f"a wavelength is in {str(primary[0].get('unit'))[:20]!r}, expected nm, um, mm, cm or m")
+            self.wrong(f"a wavelength is in {unit!r}, expected nm, um, mm, cm or m")
         try:
             return float(wavelength_grid([_scaled(self.finite(primary[0], "value"), scale)]))
         except ValueError as error:
             self.wrong(str(error))
 
     def aperture(self, held: dict[str, Any]) -> Aperture:
-        kind = held.get("type")
+        kind = self.word(held, "type")
         if kind not in ("EPD", "imageFNO", "float_by_stop_size"):
-            self.wrong(f"an aperture of type {str(kind)[:40]!r} is not read; known: EPD, imageFNO, float_by_stop_size")
+            self.wrong(f"an aperture of type {kind!r} is not read; known: EPD, imageFNO, float_by_stop_size")
         value = self.finite(held, "value")
         if value <= 0:
             self.wrong(f"the aperture is {value:g}, expected more than 0")
@@ -148,13 +154,14 @@ class _Reader:
             self.wrong("the object stands behind the lens")
 
     def surface(self, held: dict[str, Any], here: float, behind: float) -> Found:
-        if held.get("type") != "Surface":
-            self.wrong(f"a surface of type {str(held.get('type'))[:40]!r} is not read; known: Surface")
+        if self.word(held, "type") != "Surface":
+            self.wrong(f"a surface of type {self.word(held, 'type')!r} is not read; known: Surface")
         model = held.get("interaction_model") or {}
         if held.get("is_reflective") or not isinstance(model, dict) or model.get("is_reflective"):
             self.wrong("it is a mirror: kcam's lenses refract")
-        if model.get("type", "RefractiveReflectiveModel") != "RefractiveReflectiveModel":
-            self.wrong(f"its interaction is {str(model['type'])[:40]!r}, expected RefractiveReflectiveModel")
+        interaction = self.word(model, "type", "RefractiveReflectiveModel")
+        if interaction != "RefractiveReflectiveModel":
+            self.wrong(f"its interaction is {interaction!r}, expected RefractiveReflectiveModel")
         thickness, spacing = self.finite(held, "thickness", behind - here), behind - here
         if not abs(thickness - spacing) <= _SAME * max(1.0, abs(here), abs(behind)):
             self.wrong(f"its thickness is {thickness:g} mm, but the next surface stands {spacing:g} mm behind it")
@@ -170,10 +177,10 @@ class _Reader:
         return Found(cast("SurfaceArguments", arguments | aspheric), self.place)
 
     def coefficients(self, geometry: dict[str, Any]) -> dict[int, float]:
-        kind = geometry.get("type")
+        kind = self.word(geometry, "type")
         if kind not in _POWERS:
-            self.wrong(f"a geometry of type {str(kind)[:40]!r} is not read; known: {', '.join(_POWERS)}")
-        first, step = _POWERS[str(kind)]
+            self.wrong(f"a geometry of type {kind!r} is not read; known: {', '.join(_POWERS)}")
+        first, step = _POWERS[kind]
         held = geometry.get("coefficients", []) if first else []
         if not isinstance(held, list):
             self.wrong(f"'coefficients' is {str(held)[:40]!r}, expected a list")
@@ -196,7 +203,7 @@ class _Reader:
         return None if math.isinf(reach) else _scaled(reach, -3)
 
     def glass(self, held: dict[str, Any]) -> str | float | Glass | None:
-        kind, name = held.get("type"), str(held.get("name"))
+        kind = self.word(held, "type")
         if kind == "IdealMaterial":
             index = self.finite(held, "index")
             if self.value(held, "absorp", 0.0) != 0:
@@ -209,9 +216,10 @@ class _Reader:
                 return _of_formula(self.part(self.part(held, "definition"), "dispersion"))
         except ValueError as error:
             self.wrong(str(error))
-        if kind == "Material" and name.upper() in _NAMES:
+        name = self.word(held, "name") if kind == "Material" else ""
+        if name.upper() in _NAMES:
             return _NAMES[name.upper()]
-        what = f"glass {name[:40]!r}" if kind == "Material" else f"material of type {str(kind)[:40]!r}"
+        what = f"glass {name!r}" if name else f"material of type {kind!r}"
         self.wrong(f"unknown {what}; known: {', '.join(sorted(GLASSES))}, or an index and an Abbe number")
 
 
@@ -313,9 +321,10 @@ def _frame(z: float) -> dict[str, Any]:
 def _geometry(surface: Surface, z: float) -> dict[str, Any]:
     terms = layout.terms(surface)
     radius = _mm(surface.radius)
+    if not terms and math.isinf(radius) and layout.decimal(surface.conic) == 0:
+        return _plane(z)
     if not terms:
-        flat = math.isinf(radius)
-        return _plane(z) if flat else {"type": "StandardGeometry", "cs": _frame(z), "radius": radius} | _conic(surface)
+        return {"type": "StandardGeometry", "cs": _frame(z), "radius": radius} | _conic(surface)
     kind = "OddAsphere" if any(power % 2 for power in terms) else "EvenAsphere"
     first, step = _POWERS[kind]
     powers = range(first, max(terms) + 1, step)

@@ -172,7 +172,7 @@ PRESETS = {
     "wide_angle": Prescription(
         "S. Matsui, US 4,099,850 (1978), example 5, f = 28 mm f/3.5, 37 degrees, scaled from 100 mm; the patent has "
         "the diaphragm between the third lens and the fourth, and no semi-diameters: it stands in the middle, set to "
-        "f/3.5, and the others let the whole bundle pass up to 20 degrees, and about half of it at 37",
+        "f/3.5, and the others let the whole bundle pass up to 20 degrees, and 40 % of it at 37",
         6,
         0.75,
         (

@@ -93,7 +93,7 @@ class _Reader:
         raise self.error("" if line is None else f"line {line.number}, {line.word}", reason)
 
     def error(self, place: str, reason: str) -> ValueError:
-        return ValueError(f"{self.name}{place and ', '}{place}: {reason.rstrip('.')}.")
+        return layout.refusal(self.name, place, reason)
 
     def layout(self, found: str) -> Layout:
         whole, blocks = self.blocks(found)
@@ -111,11 +111,13 @@ class _Reader:
             self.wrong(
                 blocks[stops[1] + 1].words["STOP"] if stops else None, f"{len(stops)} surfaces say STOP, expected one"
             )
-        wavelength = self.wavelength(whole)
-        surfaces = layout.build(
-            items, stop=stops[0], aperture=self.aperture(whole), focus_wavelength=wavelength, error=self.error
+        return layout.build(
+            items,
+            stop=stops[0],
+            aperture=self.aperture(whole),
+            focus_wavelength=self.wavelength(whole),
+            error=self.error,
         )
-        return Layout(surfaces, last.arguments["thickness"], wavelength)
 
     # ---- words -----------------------------------------------------------------------------------------------------
 
