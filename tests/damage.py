@@ -328,7 +328,7 @@ def _run(folder: Path) -> Path:
 
 def _lens(folder: Path) -> Path:
     path = folder / "lens.json"
-    optics.CompoundLens.preset("phone").save(path)
+    optics.CompoundLens.preset("phone_odd").save(path)
     return path
 
 

@@ -101,7 +101,9 @@ def test_json_gives_every_number_back_to_its_rounding(seed: int, tmp_path: Path)
     assert_close(optics.CompoundLens.from_file(tmp_path / "x.json"), lens, rel=1e-14)
 
 
-@pytest.mark.parametrize(("name", "suffix"), [("cooke_triplet", "zmx"), ("cooke_triplet", "json"), ("phone", "json")])
+@pytest.mark.parametrize(
+    ("name", "suffix"), [("cooke_triplet", "zmx"), ("cooke_triplet", "json"), ("phone", "zmx"), ("phone_odd", "json")]
+)
 def test_a_lens_from_its_file_has_the_same_psfs(name: str, suffix: str, tmp_path: Path) -> None:
     lens = optics.CompoundLens.preset(name, focus_distance=2.0)
     lens.save(tmp_path / f"x.{suffix}")
@@ -157,7 +159,7 @@ class Held(nn.Module):
         return signal
 
 
-@pytest.mark.parametrize("name", ["ef50", "phone"])
+@pytest.mark.parametrize("name", ["ef50", "phone_odd"])
 def test_a_lens_survives_in_the_file_of_a_camera(name: str, tmp_path: Path) -> None:
     lens = optics.CompoundLens.preset(name, focus_distance=3.0)
     surface = lens.surfaces[1]
@@ -552,7 +554,7 @@ def test_materials_and_apertures_as_optiland_writes_them(tmp_path: Path) -> None
 
 
 def test_what_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
-    phone = optics.CompoundLens.preset("phone")
+    phone = optics.CompoundLens.preset("phone_odd")
     with pytest.raises(
         ValueError, match=r"surface 2 has asphere terms of r\^3, .*r\^10; a .zmx file holds .*Save it as .json"
     ):

@@ -24,6 +24,7 @@ from kcam.optics.source import PixelGrid
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 _AIMING = 10  # steps of the secant that aims a chief ray
+_AIMING_EACH = 60  # at most, of a ray to its point of the stop: a phone's, on a steep stop, takes some 40
 
 
 @dataclass(frozen=True)
@@ -271,12 +272,16 @@ class CompoundLens(nn.Module):
         to_x, to_y = semi * (x * cy - y * cx), semi * (x * cx + y * cy)
         with torch.no_grad():
             px, py = to_x / nodes.across, nodes.aim + to_y / nodes.along
-            for _ in range(_AIMING):
+            for _ in range(_AIMING_EACH):
                 started = self.launch(nodes.heights, nodes.vergences, px, py)
                 at = trace(self.surfaces, started, nodes.indices, until=self.stop)
+                off = torch.maximum((at.x - to_x).abs(), (at.y - to_y).abs()).masked_fill(~at.alive, 0.0)
+                if float(off.max()) < 1e-13:
+                    break
                 px, py = px - (at.x - to_x) / nodes.across, py - (at.y - to_y) / nodes.along
         rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
-        radius = float64(self.sensor_distance) - self.first_order().exit_pupil
+        away = float64(self.sensor_distance) - self.first_order().exit_pupil
+        radius = away.sign() * torch.sqrt(away**2 + chief.y**2)
         ox, oy = rays.x - chief.x, rays.y - chief.y
         onto = ox * rays.dx + oy * rays.dy
         back = onto + radius.sign() * torch.sqrt((onto**2 - ox**2 - oy**2 + radius**2).clamp(min=0))
