@@ -321,6 +321,13 @@ def test_the_stop_has_the_smaller_one_of_its_own_size_and_the_aperture(
         assert lens.focal_length() / width == pytest.approx(8, rel=1e-9)
 
 
+def test_a_model_glass_is_one_whatever_its_name(tmp_path: Path) -> None:
+    named = read(TEXT.replace("GLAS ___BLANK 1 0", "GLAS MODEL 1 0"), tmp_path)
+    assert numbers(named) == numbers(read(TEXT, tmp_path))
+    constant = read(TEXT.replace("1.62004 36.37", "1.62004 0"), tmp_path)
+    assert constant.surfaces[1].glass == 1.62004
+
+
 def test_an_object_nearby_leaves_the_sensor_at_the_last_distance(tmp_path: Path) -> None:
     near = read(TEXT.replace("DISZ INFINITY", "DISZ 300"), tmp_path)
     assert numbers(near) == numbers(read(TEXT, tmp_path))

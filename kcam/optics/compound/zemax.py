@@ -20,21 +20,8 @@ _UNITS = {"MM": Decimal("1e-3"), "CM": Decimal("1e-2"), "IN": Decimal("0.0254"),
 _POWERS = {"STANDARD": {}, "EVENASPH": {k: 2 * k for k in range(1, 9)}, "ODDASPHE": {k: k for k in range(1, 9)}}
 """Power of r that each parameter of a type of surface is the coefficient of."""
 _READ = {"TYPE", "CURV", "DISZ", "GLAS", "CONI", "PARM", "STOP", "DIAM", "CLAP"}
-_WITHOUT_EFFECT = {
-    "COMM",
-    "FIMP",
-    "HIDE",
-    "MIRR",
-    "SLAB",
-    "MEMA",
-    "POPS",
-    "COAT",
-    "MAZH",
-    "FLAP",
-    "PPAR",
-    "SCOL",
-    "SOPA",
-}
+_WITHOUT_EFFECT = {"COMM", "FIMP", "HIDE", "MIRR", "SLAB", "MEMA", "POPS", "COAT", "MAZH", "PZUP", "PPAR", "VDSZ"}
+_WITHOUT_EFFECT |= {"FLAP", "SCOL", "SOPA"}
 """Of a surface: how it is drawn, named, coated and solved for; FLAP is the aperture that DIAM says."""
 _NAMES = {name: {"fused silica": "SILICA", "polycarbonate": "POLYCARB"}.get(name, name.upper()) for name in GLASSES}
 _GLASSES = {theirs: ours for ours, theirs in _NAMES.items()} | {"F_SILICA": "fused silica", "BK7": "N-BK7"}
@@ -309,7 +296,7 @@ class _Reader:
         name = line.values[0].upper() if line.values else ""
         if name == "MIRROR":
             self.wrong(line, "a mirror: kcam's lenses refract")
-        if name == "___BLANK":
+        if line.values[1:2] == ["1"] or name == "___BLANK":  # a model glass, whatever its name
             index, abbe = (self.metres(line, self.value(line, place), 0) for place in (3, 4))
             try:
                 return index if abbe == 0 else Glass(index, abbe)  # without an Abbe number Zemax has no dispersion
