@@ -339,8 +339,8 @@ def _short(value: Any) -> str:
 
 
 def _classes(custom: Sequence[type[nn.Module]] = ()) -> dict[str, type]:
-    """Every class that a saved camera may hold: the public modules of kcam, and those that the caller names."""
-    table: dict[str, type] = {"Camera": Camera, "Context": Context}
+    """Every class that a saved camera may hold: kcam's public modules and glasses, and those that the caller names."""
+    table: dict[str, type] = {"Camera": Camera, "Context": Context, "optics.Glass": optics.Glass}
     for module in (optics, sensor, isp):
         for name, cls in vars(module).items():
             if inspect.isclass(cls) and issubclass(cls, nn.Module) and cls.__module__.startswith("kcam."):

@@ -182,7 +182,7 @@ class _Writer:
             return {"parameter": key, "shape": list(value.shape), "trainable": value.requires_grad}
         if isinstance(value, Tensor):
             return {"tensor": self.add(value, path), "shape": list(value.shape)}
-        if isinstance(value, (nn.Module, Context)):
+        if isinstance(value, (nn.Module, Context)) or type(value) in self.names:
             return self.encode_object(value, path=path)
         raise TypeError(
             f"cannot save {owner}: a {type(value).__name__} is none of number, string, bool, None, tuple, tensor, "

@@ -127,9 +127,9 @@ def run(
             len(source), seed=options.seed, **{name: value for name, value in changes.items() if value is not None}
         )
         weights = {} if options.content is None else {"content": options.content}
-        loss = preset.style_loss(
-            picture.to(device), features=features.to(device), crop=settings.size, **weights
-        ).to(device)
+        loss = preset.style_loss(picture.to(device), features=features.to(device), crop=settings.size, **weights).to(
+            device
+        )
         start = _camera(options, preset)
         scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0).to(device=device) for name in SHOWN]
         if leads:

@@ -326,6 +326,20 @@ def _run(folder: Path) -> Path:
     return path
 
 
+def _lens(folder: Path) -> Path:
+    path = folder / "lens.json"
+    optics.CompoundLens.preset("phone_odd").save(path)
+    return path
+
+
+def _read_lens(path: Path) -> None:
+    """A lens that was read is one that can be written, and is read again."""
+    lens = optics.CompoundLens.from_file(path)
+    again = path.with_name("again.json")
+    lens.save(again)
+    assert len(optics.CompoundLens.from_file(again).surfaces) == len(lens.surfaces)
+
+
 def _put(path: Path, text: str) -> None:
     path.write_text(text, errors="surrogatepass")
 
@@ -345,4 +359,5 @@ KINDS: dict[str, Kind] = {
     "state": Kind(_state, _take, _put_state, _read_checkpoint, lambda path: path.parent.name),
     "sweep": Kind(_sweep, _take, _put, _read_sweep),
     "run": Kind(_run, _take, _put, _config),
+    "lens": Kind(_lens, _take, _put, _read_lens),
 }

@@ -99,10 +99,12 @@ class VGG16Features(nn.Module):
         """Variance per channel of each layer; to two digits, which no machine's rounding changes."""
         pictures = [torch.tensor(read()[0], device="cpu") for read in PHOTOGRAPHS.values()]
         corners = [[(size - SAMPLE) // 2 for size in picture.shape[:2]] for picture in pictures]
-        sample = torch.stack([
-            picture[top : top + SAMPLE, left : left + SAMPLE].permute(2, 0, 1) / 255
-            for picture, (top, left) in zip(pictures, corners, strict=True)
-        ])
+        sample = torch.stack(
+            [
+                picture[top : top + SAMPLE, left : left + SAMPLE].permute(2, 0, 1) / 255
+                for picture, (top, left) in zip(pictures, corners, strict=True)
+            ]
+        )
         with torch.no_grad():
             layers = self(sample)
         natural = {name: float(f"{layer.var((0, 2, 3), correction=0).mean():.2g}") for name, layer in layers.items()}
@@ -176,9 +178,7 @@ def _checked(held: Any, expected: Mapping[str, Tensor], path: Path) -> dict[str,
         tensor = held.get(key)
         if tensor is None:
             others = ", ".join(str(other) for other in list(held)[:3]) or "nothing"
-            raise ValueError(
-                f"{path} has no {key}, expected {shape}; it has {others} .. {fix}, not another network's."
-            )
+            raise ValueError(f"{path} has no {key}, expected {shape}; it has {others} .. {fix}, not another network's.")
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point() or tensor.layout != torch.strided:
             got = f"{tensor.layout} {tensor.dtype}" if isinstance(tensor, Tensor) else type(tensor).__name__
             raise ValueError(f"{path}: {key} is a {got}, expected a dense tensor of floating-point numbers. {fix}.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from kcam.inputs import as_values
 from kcam.optics.compound import pupil
 from kcam.optics.compound.distortion import NODES, ImageHeights
 from kcam.optics.compound.field import FieldPSFs, bank
+from kcam.optics.compound.files import read_lens, write_lens
 from kcam.optics.compound.images import Frame, areas
 from kcam.optics.compound.presets import preset_surfaces
 from kcam.optics.compound.surface import Surface
@@ -24,6 +26,7 @@ from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 _AIMING = 10  # steps of the secant that aims a chief ray
+_AIMING_EACH = 60  # at most, of a ray to its point of the stop: a phone's, on a steep stop, takes some 40
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,27 @@ class CompoundLens(nn.Module):
     def preset(cls, name: str, *, focus_distance: float = math.inf, focus_wavelength: float = 550e-9) -> CompoundLens:
         """A lens from its patent: a name in `presets.PRESETS`. Raises: ValueError for an unknown one."""
         return cls(*preset_surfaces(name), focus_distance=focus_distance, focus_wavelength=focus_wavelength)
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str], *, focus_distance: float | None = None) -> CompoundLens:
+        """A lens from sequential Zemax text (.zmx) or Optiland's JSON (.json), its primary wavelength that of focus.
+
+        focus_distance: as of the constructor; None leaves the sensor where the file has the image. Raises: as
+        `files.read_lens`: FileNotFoundError; ValueError that names the line or surface that kcam cannot be.
+        """
+        found = read_lens(path, focused=focus_distance is not None)
+        distance = found.sensor_distance if focus_distance is None else None
+        return cls(
+            *found.surfaces,
+            focus_distance=focus_distance,
+            sensor_distance=distance,
+            focus_wavelength=found.focus_wavelength,
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the lens as .zmx or .json, parameters by their values. Raises: ValueError, as `files.write_lens`."""
+        self.check()
+        write_lens(path, self.surfaces, sensor_distance=self.sensor_distance, focus_wavelength=self.focus_wavelength)
 
     def configuration(self) -> dict[str, object]:
         """Constructor arguments, for saving: the sensor's distance, which was set once, rather than the focus."""
@@ -250,12 +274,16 @@ class CompoundLens(nn.Module):
         to_x, to_y = semi * (x * cy - y * cx), semi * (x * cx + y * cy)
         with torch.no_grad():
             px, py = to_x / nodes.across, nodes.aim + to_y / nodes.along
-            for _ in range(_AIMING):
+            for _ in range(_AIMING_EACH):
                 started = self.launch(nodes.heights, nodes.vergences, px, py)
                 at = trace(self.surfaces, started, nodes.indices, until=self.stop)
+                off = torch.maximum((at.x - to_x).abs(), (at.y - to_y).abs()).masked_fill(~at.alive, 0.0)
+                if float(off.max()) < 1e-13:
+                    break
                 px, py = px - (at.x - to_x) / nodes.across, py - (at.y - to_y) / nodes.along
         rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
-        radius = float64(self.sensor_distance) - self.first_order().exit_pupil
+        away = float64(self.sensor_distance) - self.first_order().exit_pupil
+        radius = away.sign() * torch.sqrt(away**2 + chief.y**2)
         ox, oy = rays.x - chief.x, rays.y - chief.y
         onto = ox * rays.dx + oy * rays.dy
         back = onto + radius.sign() * torch.sqrt((onto**2 - ox**2 - oy**2 + radius**2).clamp(min=0))

@@ -25,6 +25,10 @@ class Sellmeier:
     source: str
 
 
+D_F_C = (0.5875618, 0.4861327, 0.6562725)
+"""Fraunhofer lines that nd and vd are of [um]."""
+
+
 @dataclass(frozen=True)
 class Glass:
     """A glass as a patent states it: n(lambda) = A + B / lambda^2, through n_d and with n_F - n_C = (n_d - 1) / v_d.
@@ -42,7 +46,7 @@ class Glass:
 
     def index(self, wavelengths: Tensor) -> Tensor:
         """Refractive index at wavelengths [m], float64."""
-        d, f, c = 587.5618e-9, 486.1327e-9, 656.2725e-9
+        d, f, c = (line * 1e-6 for line in D_F_C)
         b = (self.nd - 1) / self.vd / (1 / f**2 - 1 / c**2)
         return self.nd + b * (1 / wavelengths.to(torch.float64) ** 2 - 1 / d**2)
 
