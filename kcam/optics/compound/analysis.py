@@ -15,7 +15,7 @@ from kcam.optics.numerics import fast_length, phasor, squared
 from kcam.optics.propagation import sampling
 
 SPECTRAL_LINES = (486.1e-9, 546.1e-9, 656.3e-9)
-"""F', e and C' of hydrogen, mercury and hydrogen [m]: the colours in which a lens is looked at unless others are named."""
+"""F, e and C [m]: the colours in which a lens is looked at unless others are named."""
 CRITERIA = ("rms",)
 """What `CompoundLens.refocus` can make least."""
 STEP = 1e-5  # of the stop's radius: between the rays whose directions tell how much light one stands for
@@ -31,6 +31,8 @@ class FieldCurves:
     """What a lens does over its field, at F heights.
 
     heights: Y / D of object points (F,). image_heights: of chief rays of the focus wavelength, from the axis (F,) [m].
+    Printed, a table: light is the relative illumination, the difference of two wavelengths is lateral colour, and MTFs
+    are sagittal and tangential.
     relative_illumination, distortion (F,). lateral_colour: how much farther from the axis than the focus wavelength
     each wavelength lands (F, L) [m]. rms_spot: of all light about its centroid (F,) [m]. mtf: of all wavelengths
     together, sagittal and tangential at each frequency (F, 2, K). wavelengths (L,) [m], frequencies (K,) [cycles per
@@ -46,6 +48,27 @@ class FieldCurves:
     mtf: Tensor
     wavelengths: Tensor
     frequencies: Tensor
+
+    def __str__(self) -> str:
+        lines = [f"{value * 1e9:.0f}" for value in self.wavelengths.tolist()]
+        columns = {
+            "Y / D": [f"{value:.3f}" for value in self.heights.tolist()],
+            "image [mm]": [f"{value * 1e3:.2f}" for value in self.image_heights.tolist()],
+            "light [%]": [f"{100 * value:.1f}" for value in self.relative_illumination.tolist()],
+            "distortion [%]": [f"{100 * value:.2f}" for value in self.distortion.tolist()],
+            f"{lines[-1]} - {lines[0]} nm [um]": [
+                f"{value * 1e6:.2f}" for value in (self.lateral_colour[:, -1] - self.lateral_colour[:, 0]).tolist()
+            ],
+            "rms spot [um]": [f"{value * 1e6:.1f}" for value in self.rms_spot.tolist()],
+        }
+        for index, frequency in enumerate(self.frequencies.tolist()):
+            columns[f"MTF at {frequency / 1e3:.3g} / mm"] = [
+                f"{sagittal:.2f} {tangential:.2f}" for sagittal, tangential in self.mtf[:, :, index].tolist()
+            ]
+        widths = [max(len(name), *map(len, values)) for name, values in columns.items()]
+        rows = [list(columns), *map(list, zip(*columns.values(), strict=True))]
+        text = ("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+        return "\n".join(text)
 
 
 def hexapolar(rings: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -82,8 +105,8 @@ def evenly(passes: Tensor, count: int) -> Tensor:
 
 def first(rays: Rays) -> Rays:
     """The first of stacked bundles."""
-    parts = (part[0] for part in (rays.x, rays.y, rays.dx, rays.dy, rays.path, rays.alive))
-    return Rays(*parts, tuple(part[0] for part in rays.clearance))
+    clearance = tuple(part[0] for part in rays.clearance)
+    return Rays(rays.x[0], rays.y[0], rays.dx[0], rays.dy[0], rays.path[0], rays.alive[0], clearance)
 
 
 def light(rays: Rays, area: Tensor) -> Tensor:
@@ -182,9 +205,10 @@ def transfer(fitted: PupilFit, node: int, frequencies: Tensor, *, wavelength: fl
         return (weights * phasor(2 * math.pi / wavelength * (ahead - behind))).sum() * spacing**2
 
     whole = overlap(0.0, 0).real
-    return torch.stack(
-        [torch.stack([overlap(frequency, axis) for frequency in frequencies.tolist()]) for axis in (0, 1)]
-    ) / whole
+    return (
+        torch.stack([torch.stack([overlap(frequency, axis) for frequency in frequencies.tolist()]) for axis in (0, 1)])
+        / whole
+    )
 
 
 def _centred(count: int, spacing: float) -> Tensor:

@@ -509,12 +509,12 @@ class CompoundLens(nn.Module):
             light = light / light.sum(-1, keepdim=True) * counts[..., None]
             lit = counts.sum(1) > 0
             shift = analysis.sharpest(*(part[lit].flatten(1, 2) for part in (points, slopes, light)))
-            best: Scalar = float(self.sensor_distance) + shift
+            best = float(self.sensor_distance) + shift
         if best <= 0:
-            raise ValueError(f"the best focus is {-float(best):g} m inside the lens, not behind it: focus farther away.")
-        if isinstance(self.sensor_distance, nn.Parameter):
-            best = nn.Parameter(torch.full_like(self.sensor_distance, best))
-        arguments = self.configuration() | {"sensor_distance": best}
+            raise ValueError(f"the best focus is {-best:g} m inside the lens, not behind it: focus farther away.")
+        trained = isinstance(self.sensor_distance, nn.Parameter)
+        placed = nn.Parameter(torch.full_like(self.sensor_distance, best)) if trained else best  # type: ignore[arg-type]
+        arguments = self.configuration() | {"sensor_distance": placed}
         del arguments["surfaces"]
         return type(self)(*self.surfaces, **arguments)  # type: ignore[arg-type]
 
@@ -567,7 +567,7 @@ class CompoundLens(nn.Module):
         points, weights = self.spots(grid, distances=distance, field=field)
         return analysis.FieldCurves(
             heights=field[:, 1],
-            image_heights=-landed[:, -1],
+            image_heights=landed[:, -1].abs(),
             relative_illumination=self.relative_illumination(field, distances=distance),
             distortion=self.distortion(field, distance=distance),
             lateral_colour=landed[:, -1:] - landed[:, :-1],
