@@ -16,6 +16,7 @@ from torch import Tensor
 
 from kcam.optics import CompoundLens
 from kcam.optics.compound.analysis import SPECTRAL_LINES, FieldCurves, rms_radius
+from kcam.optics.numerics import Scalar, float64
 from kcam.plots.pictures import light_colours
 from kcam.plots.psf import CURVE_COLOURS
 from kcam.plots.sheet import FAINT, INK, LABEL, MUTED, SMALL, TITLE, Sheet, metres, quiet
@@ -29,7 +30,7 @@ FIELDS_IN_ROWS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _EDGE, _HEAD, _CELL, _GAP, _ROW = 0.5, 1.3, 2.1, 0.52, 0.55  # inches
 _WIDTH = 5 * _CELL + 4 * _GAP
 _HIGHEST = 4.2  # inches of a section
-_TEXT_WIDTH = 5.4  # inches of `lens_text`
+_TEXT_WIDTH = 4.7  # inches of `lens_text`
 _SAMPLES = 49  # across the stop
 
 
@@ -159,6 +160,11 @@ def _chosen(
     return [edge * share for share in shares]
 
 
+def _number(value: Scalar) -> float:
+    """Of a lens, also where it trains."""
+    return float(float64(value).detach())
+
+
 def _colours(wavelengths: Sequence[float] | None) -> Tensor:
     return wavelength_grid(list(SPECTRAL_LINES if wavelengths is None else wavelengths))
 
@@ -174,8 +180,8 @@ def _heading(sheet: Sheet, lens: CompoundLens, title: str, distance: float | Non
     sheet.text(
         _EDGE,
         0.64,
-        f"Focal length {float(first.focal_length) / mm:.4g} mm, f/{lens.f_number:.3g}, "
-        f"{len(lens.surfaces)} surfaces, sensor {float(lens.sensor_distance) / mm:.4g} mm behind the last{where}",
+        f"Focal length {_number(first.focal_length) / mm:.4g} mm, f/{lens.f_number:.3g}, "
+        f"{len(lens.surfaces)} surfaces, sensor {_number(lens.sensor_distance) / mm:.4g} mm behind the last{where}",
         colour=MUTED,
     )
 
@@ -183,19 +189,19 @@ def _heading(sheet: Sheet, lens: CompoundLens, title: str, distance: float | Non
 def lens_text(lens: CompoundLens) -> str:
     """Focal length, f-number, back focus and pupils at the focus wavelength, a line for each."""
     first, at = lens.first_order(), f"at {lens.focus_wavelength / nm:.0f} nm"
-    sensor = float(lens.sensor_distance)
+    sensor = _number(lens.sensor_distance)
 
     def length(value: float) -> str:
         return f"{value / mm:.4g} mm"
 
     def pupil(position: Tensor, semi: Tensor, vertex: str) -> str:
-        side = "behind" if float(position) >= 0 else "in front of"
-        return f"{length(2 * float(semi))} wide, {length(abs(float(position)))} {side} the {vertex} vertex"
+        side = "behind" if _number(position) >= 0 else "in front of"
+        return f"{length(2 * _number(semi))} wide, {length(abs(_number(position)))} {side} the {vertex} vertex"
 
     lines = (
-        ("focal length", f"{length(float(first.focal_length))} {at}"),
+        ("focal length", f"{length(_number(first.focal_length))} {at}"),
         ("f-number", f"f/{lens.f_number:.3g}"),
-        ("back focus", length(float(first.back_focus))),
+        ("back focus", length(_number(first.back_focus))),
         ("sensor", f"{length(sensor)} behind the last vertex"),
         ("entrance pupil", pupil(first.entrance_pupil, first.entrance_semi_diameter, "first")),
         ("exit pupil", pupil(first.exit_pupil, first.exit_semi_diameter, "last")),
@@ -216,14 +222,14 @@ def _name(sheet: Sheet, text: str, top: float) -> None:
 
 def _section(lens: CompoundLens, heights: Sequence[float], distance: float) -> _Section:
     with torch.no_grad():
-        vertices = np.cumsum([0.0, *(float(surface.thickness) for surface in lens.surfaces[:-1])])
-        sensor = vertices[-1] + float(lens.sensor_distance)
+        vertices = np.cumsum([0.0, *(_number(surface.thickness) for surface in lens.surfaces[:-1])])
+        sensor = vertices[-1] + _number(lens.sensor_distance)
         lead = min(0.12 * sensor, 0.9 * distance)
         rays = lens.paths(list(heights), distance=distance, lead=lead).numpy() / mm
         surfaces = []
         for index, (surface, vertex) in enumerate(zip(lens.surfaces, vertices, strict=True)):
             lit = 1.02 * np.abs(rays[:, :, index + 1, 1]).max() * mm  # what clips nothing is drawn as wide as its light
-            reach = lit if surface.semi_diameter is None else float(surface.semi_diameter)
+            reach = lit if surface.semi_diameter is None else _number(surface.semi_diameter)
             y = torch.linspace(-reach, reach, 121, dtype=torch.float64)
             surfaces.append(np.stack([vertex + surface.sag(y**2)[0].numpy(), y.numpy()], 1) / mm)
     tall = max(np.abs(part[:, 1]).max() for part in surfaces)
@@ -361,7 +367,7 @@ def _draw_wavefronts(
 
 
 def _draw_curves(sheet: Sheet, curves: FieldCurves, top: float) -> None:
-    at = curves.image_heights.abs().double().numpy() / mm
+    at = curves.image_heights.detach().numpy() / mm
     between = np.linspace(0, at[-1], 201)
 
     def drawn(axes: Any, curve: Tensor, **style: Any) -> None:
@@ -376,7 +382,7 @@ def _draw_curves(sheet: Sheet, curves: FieldCurves, top: float) -> None:
     drawn(distortion, 100 * curves.distortion, color=INK)
     hues = [tuple(0.8 * part for part in hue) for hue in light_colours(curves.wavelengths)]
     for index, hue in enumerate(hues):
-        name = f"{float(curves.wavelengths[index]) / nm:.0f} nm"
+        name = f"{float(curves.wavelengths[index]) / nm:.0f}"
         drawn(colour, curves.lateral_colour[:, index] / um, color=hue, label=name)
     drawn(spot, curves.rms_spot / um, color=INK)
     spot.set(ylim=(0, None))
@@ -384,14 +390,17 @@ def _draw_curves(sheet: Sheet, curves: FieldCurves, top: float) -> None:
         for which, style in enumerate(("-", "--")):
             name = f"{frequency * mm:.3g} / mm" if which == 0 else "_"  # which a legend leaves out
             drawn(contrast, curves.mtf[:, which, index], color=CURVE_COLOURS[index], ls=style, label=name)
-    contrast.set(ylim=(0, 1.02))
-    titles = ("Relative illumination [%]", "Distortion [%]", "Lateral colour [\u00b5m]", "Rms spot [\u00b5m]")
+    contrast.set(ylim=(0, 1.25), yticks=[0, 0.2, 0.4, 0.6, 0.8, 1])
+    titles = ("Relative illumination [%]", "Distortion [%]", "Lateral colour [\u00b5m], nm", "Rms spot [\u00b5m]")
     for axes, title in zip(panels, (*titles, "MTF, tangential dashed"), strict=True):
         axes.set_title(title, size=LABEL, weight="bold", loc="left", color=INK)
         _finish(axes, "image height [mm]")
         axes.set(xlim=(0, at[-1]))
+    low, high = colour.get_ylim()
+    colour.set(ylim=(low, high + 0.25 * (high - low)))  # room for the names of the lines, which then hide none
+    key = {"frameon": False, "fontsize": SMALL, "labelcolor": INK, "handlelength": 1.0, "columnspacing": 1.0}
     for axes in (colour, contrast):
-        axes.legend(frameon=False, fontsize=SMALL, labelcolor=INK, handlelength=1.4)
+        axes.legend(loc="upper left", ncols=3, borderaxespad=0.1, handletextpad=0.4, **key)
 
 
 def _finish(axes: Any, label: str) -> None:
