@@ -278,7 +278,7 @@ def lens(
     focus: Annotated[
         str, typer.Option("--focus", help='what is in focus, in metres: 2, "50 cm"; else inf, or as the file says')
     ] = "",
-    distance: Annotated[str, typer.Option("--distance", help="of the points; else that of --focus")] = "",
+    distance: Annotated[str, typer.Option("--distance", help="of the points; else that of --focus, or inf")] = "",
     field: Annotated[
         float, typer.Option("--field", help="largest Y / D; else where a fifth of the light is left, or rays are lost")
     ] = 0.0,
