@@ -29,8 +29,8 @@ FIELDS_IN_ROWS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Of the field's edge: points whose spots and wavefronts are drawn."""
 _EDGE, _HEAD, _CELL, _GAP, _ROW = 0.5, 1.3, 2.1, 0.52, 0.55  # inches
 _WIDTH = 5 * _CELL + 4 * _GAP
-_HIGHEST = 4.2  # inches of a section
-_TEXT_WIDTH = 4.7  # inches of `lens_text`
+_HIGHEST = 4.0  # inches of a section
+_TEXT_WIDTH = 4.6  # inches of `lens_text`
 _SAMPLES = 49  # across the stop
 
 
@@ -195,7 +195,7 @@ def lens_text(lens: CompoundLens) -> str:
         return f"{value / mm:.4g} mm"
 
     def pupil(position: Tensor, semi: Tensor, vertex: str) -> str:
-        side = "behind" if _number(position) >= 0 else "in front of"
+        side = "behind" if _number(position) >= 0 else "before"
         return f"{length(2 * _number(semi))} wide, {length(abs(_number(position)))} {side} the {vertex} vertex"
 
     lines = (
@@ -243,8 +243,8 @@ def _section(lens: CompoundLens, heights: Sequence[float], distance: float) -> _
 
 def _draw_section(sheet: Sheet, lens: CompoundLens, section: _Section, heights: Sequence[float], *, top: float) -> None:
     width, tall = section.size(_WIDTH)
-    if width < sheet.width - _TEXT_WIDTH - 2 * _EDGE:
-        where = sheet.width - _EDGE - _TEXT_WIDTH
+    where = sheet.width - _EDGE - _TEXT_WIDTH
+    if _EDGE + width + 0.2 <= where:
         sheet.text(where, top + 0.3, lens_text(lens), size=SMALL, family="monospace", colour=MUTED, linespacing=1.7)
     left = _EDGE
     for height, colour in zip(heights, CURVE_COLOURS, strict=False):
@@ -352,7 +352,7 @@ def _draw_wavefronts(
         axes.spines[:].set_color(FAINT)
         axes.add_patch(matplotlib.patches.Circle((0, 0), 1, fill=False, color=MUTED, lw=0.6))
         deviation, span = float(np.nanstd(shown)), float(np.nanmax(shown) - np.nanmin(shown))
-        text = f"Y / D = {heights[column]:.3g};  rms {deviation:.2g}\npeak to valley {span:.3g}"
+        text = f"Y / D = {heights[column]:.3g};  rms {deviation:.3g}\npeak to valley {span:.3g}"
         sheet.text(_left(column), top + _CELL + 0.06, text, size=SMALL, colour=MUTED)
         fans = sheet.axes(_left(column), below, _CELL, _CELL)
         for index, colour in enumerate(colours):
@@ -378,7 +378,7 @@ def _draw_curves(sheet: Sheet, curves: FieldCurves, top: float) -> None:
     panels = [sheet.axes(_left(column), top, _CELL, _CELL) for column in range(5)]
     illumination, distortion, colour, spot, contrast = panels
     drawn(illumination, 100 * curves.relative_illumination, color=INK)
-    illumination.set(ylim=(0, 105))
+    illumination.set(ylim=(0, 105 * max(1.0, _number(curves.relative_illumination.max()))))
     drawn(distortion, 100 * curves.distortion, color=INK)
     hues = [tuple(0.8 * part for part in hue) for hue in light_colours(curves.wavelengths)]
     for index, hue in enumerate(hues):

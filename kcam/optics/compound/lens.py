@@ -410,7 +410,7 @@ class CompoundLens(nn.Module):
 
     def modulation(
         self,
-        frequencies: Tensor | list[float],
+        frequencies: Tensor | Sequence[float],
         *,
         wavelengths: Tensor | list[float] | None = None,
         distance: float = math.inf,
@@ -509,7 +509,7 @@ class CompoundLens(nn.Module):
             light = light / light.sum(-1, keepdim=True) * counts[..., None]
             lit = counts.sum(1) > 0
             shift = analysis.sharpest(*(part[lit].flatten(1, 2) for part in (points, slopes, light)))
-            best = float(float64(self.sensor_distance)) + shift
+            best = float(float64(self.sensor_distance).detach()) + shift
         if best <= 0:
             raise ValueError(f"the best focus is {-best:g} m inside the lens, not behind it: focus farther away.")
         trained = isinstance(self.sensor_distance, nn.Parameter)
@@ -548,7 +548,7 @@ class CompoundLens(nn.Module):
         *,
         wavelengths: Tensor | list[float] | None = None,
         distance: float = math.inf,
-        frequencies: Tensor | list[float] = (10e3, 30e3),  # type: ignore[assignment]
+        frequencies: Tensor | Sequence[float] = (10e3, 30e3),
     ) -> analysis.FieldCurves:
         """What this lens does over its field, in numbers.
 
