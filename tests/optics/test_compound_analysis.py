@@ -432,7 +432,8 @@ def overlapping(figure: Figure) -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("name", ["cooke_triplet", pytest.param("ef50", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cooke_triplet", "ef50"])
 def test_texts_of_a_sheet_do_not_cover_each_other(name: str) -> None:
     lens = optics.CompoundLens.preset(name)
     with torch.no_grad():
@@ -453,6 +454,7 @@ def test_a_lens_that_trains_is_drawn() -> None:
     assert curves.rms_spot.requires_grad
     figure = plots.lens_figure(lens, curves)
     assert len(figure.axes) == 21
+    assert overlapping(figure) == []
     assert "focal length    50 mm" in plots.lens_text(lens)
 
 

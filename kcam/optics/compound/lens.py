@@ -422,8 +422,8 @@ class CompoundLens(nn.Module):
             frequencies: (K,) >= 0 [cycles per metre]: 30 line pairs per mm are 30 / mm.
             wavelengths: (L,) [m], None for those of `analysis.SPECTRAL_LINES`. distance: of the object [m].
             field: (F, 2) of object points.
-        Returns: (F, 2, K) in [0, 1]. Sagittal lines vary across the direction in which the point's image lies from the
-            axis, tangential ones along it; on the axis, x and y.
+        Returns: (F, 2, K) in [0, 1]: of sagittal lines, which run along the direction in which the point's image lies
+            from the axis, so that their frequency is across it, and of tangential ones; on the axis, in x and in y.
         Raises: ValueError for frequencies that are negative or not finite; as `psf`.
         """
         lines = as_values(frequencies, name="frequencies", unit="cycles per metre").to(torch.float64).reshape(-1)
