@@ -237,7 +237,9 @@ def _section(lens: CompoundLens, heights: Sequence[float], distance: float) -> _
     low, high = seen[:, 1].min(), max(seen[:, 1].max(), 1.2 * tall)
     low = min(low, -1.2 * tall)
     room = 0.03 * (high - low)
-    limits = (float(seen[:, 0].min()), sensor / mm * 1.01, float(low - room), float(high + room))
+    left, right = float(seen[:, 0].min()), 1.01 * sensor / mm
+    inch = (right - left) / _WIDTH  # where the drawing is as wide as the sheet: room for the scale and the stop's name
+    limits = (left, right, float(low - room - 0.3 * inch), float(high + room + 0.15 * inch))
     return _Section(surfaces, rays, sensor / mm, limits)
 
 
@@ -277,7 +279,7 @@ def _draw_section(sheet: Sheet, lens: CompoundLens, section: _Section, heights: 
     reach = 1.05 * max(np.abs(ends).max(), 1e-3)
     axes.plot([section.sensor] * 2, [-reach, 0.05 * reach], color=INK, lw=2.5, zorder=5, gid="sensor")
     step = _round_length(0.2 * (section.limits[1] - section.limits[0]))
-    across = section.limits[2] + 0.05 * (section.limits[3] - section.limits[2])
+    across = section.limits[2] + 0.06 * (section.limits[1] - section.limits[0]) / _WIDTH
     start = section.limits[0] + 0.01 * (section.limits[1] - section.limits[0])
     axes.plot([start, start + step], [across] * 2, color=MUTED, lw=1.5, solid_capstyle="butt")
     axes.annotate(f"{step:g} mm", (start, across), (0, 3), textcoords="offset points", size=SMALL, color=MUTED)
@@ -380,6 +382,9 @@ def _draw_curves(sheet: Sheet, curves: FieldCurves, top: float) -> None:
     drawn(illumination, 100 * curves.relative_illumination, color=INK)
     illumination.set(ylim=(0, 105 * max(1.0, _number(curves.relative_illumination.max()))))
     drawn(distortion, 100 * curves.distortion, color=INK)
+    low, high = distortion.get_ylim()
+    distortion.set(ylim=(min(low, -0.2), max(high, 0.2)))  # what nobody sees is shown as little
+    distortion.locator_params(axis="y", nbins=5)  # with fewer decimals, which have their place
     hues = [tuple(0.8 * part for part in hue) for hue in light_colours(curves.wavelengths)]
     for index, hue in enumerate(hues):
         name = f"{float(curves.wavelengths[index]) / nm:.0f}"

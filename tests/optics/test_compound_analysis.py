@@ -322,6 +322,11 @@ def test_the_field_ends_where_chief_rays_are_lost() -> None:
         lens.image_point([LINE], distances=math.inf, field=torch.tensor([[0.0, 1.001 * edge]]))
 
 
+def test_a_field_without_an_edge_ends_at_sixty_degrees() -> None:
+    lens, _ = perfect(1 * mm)
+    assert lens.field_limit() == pytest.approx(math.tan(math.pi / 3))
+
+
 def test_field_curves_of_a_simple_lens() -> None:
     """A stop in front: rays off the axis are bent back to it, blue more than red; and the table says it."""
     lens = singlet()

@@ -26,7 +26,7 @@ from kcam.units import check_distances, check_pixel_pitch, check_positive, wavel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WIDEST, _INTERVALS, _NESTED = 80.0, 16, 4  # degrees; of a search for the edge of the field
+_WIDEST, _INTERVALS, _NESTED = 60.0, 16, 4  # degrees; of a search for the edge of the field
 _AIMING = 10  # steps of the secant that aims a chief ray
 
 
@@ -520,7 +520,7 @@ class CompoundLens(nn.Module):
 
     def field_limit(self, *, least: float = 0.2, distance: float = math.inf) -> float:
         """Largest height Y / D up to which the relative illumination is above `least` and chief rays pass: by nested
-        intervals of the angle, to 0.002 degrees; 80 degrees where they do so up to there.
+        intervals of the angle, to 0.001 degrees; that of 60 degrees where they do so up to there.
         """
         self.check()
         vergences = 1 / check_distances(distance).reshape(-1)
@@ -537,7 +537,7 @@ class CompoundLens(nn.Module):
                 passes = chief.alive[:, 0, 0, 0] & (light > least * light[0])
                 fails = torch.nonzero(~passes[1:])
                 if not len(fails):
-                    break
+                    return math.tan(high)
                 first = int(fails[0])
                 low, high = float(angles[max(first - 1, 0)]), float(angles[first])
         return math.tan(low)
