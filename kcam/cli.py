@@ -1,4 +1,4 @@
-"""The command `kcam`: demo, shoot, psf, explain, calibrate, tradeoff, train, paint.
+"""The command `kcam`: demo, shoot, psf, lens, explain, calibrate, tradeoff, train, paint.
 
 Only here are quantities strings with units.
 """
@@ -22,6 +22,7 @@ from kcam import __version__
 
 if TYPE_CHECKING:
     from kcam.camera import Camera
+    from kcam.optics import CompoundLens
     from kcam.scene import Scene
     from kcam.style import Progress as StepProgress
 
@@ -32,6 +33,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "rich" would take [pixels] for a style, and drop it
 )
+LENS_SUFFIXES = (".zmx", ".json")
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; without it, everything'
@@ -111,6 +113,21 @@ def open_scene(name: str, *, size: int) -> Scene:
     if Path(name).suffix or Path(name).exists():
         return Scene.from_file(name).resized(size)
     raise ValueError(f'unknown scene "{name}": expected one of {", ".join(BUILTIN)}, or a picture file.')
+
+
+def open_lens(name: str, *, focus: str) -> CompoundLens:
+    """A preset by its name, or a prescription by its path, focused at a distance; of a file "" is its own."""
+    from kcam.optics import CompoundLens
+    from kcam.optics.compound.presets import PRESETS
+
+    if Path(name).suffix.lower() in LENS_SUFFIXES:
+        return CompoundLens.from_file(name, focus_distance=length(focus, name="focus") if focus else None)
+    if name in PRESETS:
+        return CompoundLens.preset(name, focus_distance=length(focus or "inf", name="focus"))
+    raise ValueError(
+        f'unknown lens "{name}": expected a preset ({", ".join(sorted(PRESETS))}) or a file that ends in '
+        f"{' or '.join(LENS_SUFFIXES)}."
+    )
 
 
 @contextmanager
@@ -251,6 +268,59 @@ def psf(
                 else None,
                 title=f"{Path(camera).stem} camera",
             )
+        plots.save_figure(figure, out)
+        typer.echo(out)
+
+
+@app.command()
+def lens(
+    name: Annotated[str, typer.Argument(help="a preset such as cooke_triplet or ef50, or a .zmx or .json file")],
+    focus: Annotated[
+        str, typer.Option("--focus", help='what is in focus, in metres: 2, "50 cm"; else inf, or as the file says')
+    ] = "",
+    distance: Annotated[str, typer.Option("--distance", help="of the points; else that of --focus, or inf")] = "",
+    field: Annotated[
+        float, typer.Option("--field", help="largest Y / D; else where a fifth of the light is left, or rays are lost")
+    ] = 0.0,
+    wavelengths: Annotated[str, typer.Option("--wavelengths", help='in nanometres: "486, 546, 656"')] = "",
+    frequency: Annotated[float, typer.Option("--frequency", help="of the MTF [line pairs per mm]")] = 30.0,
+    refocus: Annotated[
+        bool, typer.Option("--refocus", help="move the sensor to the least rms spot on the axis")
+    ] = False,
+    out: Annotated[Path, typer.Option("--out", help="the figure to write: .png, .pdf or .svg")] = Path("lens.png"),
+) -> None:
+    """Say and draw what a real lens does: its section, and spots, wavefronts, illumination and MTF over its field."""
+    with one_line_errors():
+        import torch
+
+        from kcam import plots
+        from kcam.units import WAVELENGTH_RANGE, mm
+
+        plots.check_writable(out, suffixes=plots.FIGURE_SUFFIXES)
+        least, most = WAVELENGTH_RANGE
+        if not 0 <= field < math.inf:
+            raise ValueError(f"field {field:g} is no height Y / D: expected e.g. 0.36, which is 19.8 degrees.")
+        if not 0 < frequency < math.inf:
+            raise ValueError(f"frequency {frequency:g} is none: expected line pairs per mm > 0, such as 30.")
+        colours = None
+        if wavelengths:
+            colours = lengths(wavelengths, unit="nm", name="wavelengths", expected="486, 656", least=least, most=most)
+        shown = open_lens(name, focus=focus)
+        away = length(distance or focus or "inf")
+        with torch.no_grad(), progress("lens"):
+            if refocus:
+                before = float(shown.sensor_distance)
+                shown = shown.refocus("rms", distance=away, wavelengths=colours)
+                typer.echo(f"sensor moved by {(float(shown.sensor_distance) - before) / mm:+.4f} mm")
+            edge = field or shown.field_limit(distance=away)
+            curves = shown.field_curves(
+                torch.linspace(0, edge, 11, dtype=torch.float64),
+                wavelengths=colours,
+                distance=away,
+                frequencies=[frequency / 3 / mm, frequency / mm],
+            )
+            figure = plots.lens_figure(shown, curves, distance=away, title=Path(name).stem)
+        typer.echo(f"{plots.lens_text(shown)}\n\n{curves}\n")
         plots.save_figure(figure, out)
         typer.echo(out)
 

@@ -230,6 +230,60 @@ def test_psf_bad_input(tmp_path: Path) -> None:
     assert "with commas" in fails("psf", "--out", tmp_path / "psf.png", "--distances", "1;2")
 
 
+def test_lens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file is read with what was asked to be in focus; the table says what the lens does."""
+    asked = []
+
+    def from_file(path: str, *, focus_distance: float | None = None) -> optics.CompoundLens:
+        asked.append((path, focus_distance))
+        return optics.CompoundLens(
+            optics.Surface(thickness=3 * mm, glass=1.5, semi_diameter=2 * mm, stop=True),
+            optics.Surface(radius=-25 * mm),
+            sensor_distance=49 * mm,
+        )
+
+    monkeypatch.setattr(optics.CompoundLens, "from_file", staticmethod(from_file), raising=False)
+    out = tmp_path / "lens.png"
+    options = ("--out", out, "--field", 0.1, "--wavelengths", "500, 600", "--frequency", 20)
+    text = run("lens", "mine.ZMX", "--refocus", *options)
+    assert text.splitlines()[0].startswith("sensor moved by +0.")
+    assert "focal length    50 mm at 550 nm" in text
+    assert "600 - 500 nm [um]" in text
+    assert "MTF at 20 / mm" in text
+    rows = [line.split() for line in text.splitlines() if re.match(r" *\d\.\d{3} ", line)]
+    assert len(rows) == 11
+    assert rows[-1][0] == "0.100"
+    assert float(rows[-1][1]) == pytest.approx(5, rel=0.03)
+    assert text.splitlines()[-1] == str(out)
+    with Image.open(out) as figure:
+        assert figure.width > 1200
+    run("lens", "mine.json", "--focus", "50 cm", *options)
+    assert asked == [("mine.ZMX", None), ("mine.json", 0.5)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cooke_triplet", "ef50"])
+def test_lens_of_a_preset(name: str, tmp_path: Path) -> None:
+    text = run("lens", name, "--focus", 2, "--out", tmp_path / "lens.pdf")
+    assert re.search(r"focal length    5\d(\.\d+)? mm", text)
+    light = [float(line.split()[2]) for line in text.splitlines() if re.match(r" *\d\.\d{3} ", line)]
+    assert light[0] == 100
+    assert light[-1] == pytest.approx(20, abs=1.5)
+
+
+def test_lens_bad_input(tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "lens.png")
+    line = fails("lens", "zoom", *out)
+    assert 'unknown lens "zoom": expected a preset (cooke_triplet, double_gauss, ' in line
+    assert "ends in .zmx or .json" in line
+    assert "must end in one of" in fails("lens", "ef50", "--out", tmp_path / "lens.txt")
+    assert "field -1 is no height Y / D" in fails("lens", "ef50", "--field", -1, *out)
+    assert "frequency 0 is none" in fails("lens", "ef50", "--frequency", 0, *out)
+    assert 'focus "near" is not a length' in fails("lens", "ef50", "--focus", "near", *out)
+    assert "has no real image" in fails("lens", "ef50", "--focus", "1 cm", *out)
+    assert "chief ray of a point at 3 " in fails("lens", "ef50", "--field", 3, *out)
+
+
 def shown(distances: list[float]) -> tuple[int, int, str]:
     """(side of the panels, least share in percent, the whole caption) of the phone's figure at 550 nm."""
     figure = plots.psf_figure(Camera.phone()[0], distances=distances, wavelengths=[550 * nm], title="phone")

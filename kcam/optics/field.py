@@ -97,11 +97,14 @@ class FieldPicture:
         )
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Where distortion brings them."""
-        moves = self.distortion((planes.shape[-2], planes.shape[-1]))
-        if moves is None:
-            return planes, shares
-        return moves(planes), None if shares is None else moves(shares)
+        """Where distortion brings them, planes times the relative illumination there: nodes share out what is left."""
+        height, width = picture = (planes.shape[-2], planes.shape[-1])
+        moves = self.distortion(picture)
+        if moves is not None:
+            planes, shares = moves(planes), None if shares is None else moves(shares)
+        y, x = (torch.arange(n, dtype=torch.float64, device=planes.device) - (n - 1) / 2 for n in (height, width))
+        places = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+        return planes * self.psfs.illumination(self._on_sensor(places)).to(planes), shares
 
     def distortion(self, picture: tuple[int, int]) -> Resampling | None:
         """From the scene's pixels to the picture's; None where nothing moves."""
@@ -114,7 +117,9 @@ class FieldPicture:
 
     def bank(self, places: Tensor) -> Tensor:
         """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
-        return self.psfs.bank(self._on_sensor(places), self.pixels, whole=self.whole)
+        on_sensor = self._on_sensor(places)
+        psfs = self.psfs.bank(on_sensor, self.pixels, whole=self.whole)
+        return psfs / self.psfs.illumination(on_sensor).to(psfs).view(-1, 1, 1, 1, 1)
 
     def explain(self, planes: Tensor, shares: Tensor | None) -> FieldEstimate:
         """What `light` will do, and what it is off by."""
@@ -167,11 +172,12 @@ class FieldPicture:
             patches.append([None if part is None else part[..., places[0], places[1]] for part in (extended, around)])
         corners = torch.cartesian_prod(*[torch.tensor([-apart / 2, apart / 2], dtype=torch.float64)] * 2)
         last = torch.tensor([width - 1, height - 1], dtype=torch.float64) / 2
-        worst, (before, left) = 0.0, (m // 2 for m in self.pixels.shape)
+        worst, uneven, (before, left) = 0.0, 0.0, (m // 2 for m in self.pixels.shape)
         for x, y in _CELLS:
             middle = torch.tensor([[x, y]], dtype=torch.float64) * (last - apart / 2).clamp(min=0)
             psfs = self.bank(torch.cat([middle, torch.maximum(torch.minimum(middle + corners, last), -last)]))
             off, squares = psfs[0] - psfs[1:].mean(0), 0.0
+            uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
             for own, part in patches:
                 found = self.render(off, own, part, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
                 squares += float(found.double().square().sum())
@@ -180,7 +186,7 @@ class FieldPicture:
         step = max(1, math.isqrt(height * width // _SAMPLED))
         point = planes.new_ones(1, psfs.shape[2], 1, 1)
         light = self.render(point, planes[..., ::step, ::step].contiguous(), None).double().square().sum() * step**2
-        return math.sqrt(worst * weight / max(float(light), 1e-300))
+        return math.sqrt(worst * weight / max(float(light), 1e-300) + uneven**2)
 
 
 def _detail(planes: Tensor) -> Tensor:

@@ -65,7 +65,7 @@ class Imaging(Stage):
         field: whether the PSF varies over the picture, with distortion, lateral colour and vignetting; None: with a
             `CompoundLens`. False: every pixel sees the PSF of the axis.
         centre: of the picture, x and y on the sensor from the axis [m], as light falls: a sensor that is cropped or
-            shifted.
+            shifted; None: on the axis.
         accuracy: what is computed and what is left out, an `Accuracy`; shortcuts: its arguments one by one, over those.
             Each is an attribute of the stage too, and may be set.
     Raises: ValueError for an unknown border, a pitch or distance not in metres, and what `Accuracy` refuses.
@@ -81,7 +81,7 @@ class Imaging(Stage):
         border: str = "reflect",
         distance: float | None = None,
         field: bool | None = None,
-        centre: tuple[float, float] = (0.0, 0.0),
+        centre: tuple[float, float] | None = None,
         accuracy: Accuracy = _DEFAULT,
         **shortcuts: Unpack[Shortcuts],
     ) -> None:
@@ -102,7 +102,7 @@ class Imaging(Stage):
         self.integrate, self.border, self.distance = integrate, border, distance
         if field and not isinstance(lens, FieldSource):
             raise ValueError(f"a {type(lens).__name__} has one PSF, that on the axis: leave out field=True.")
-        self.field, self.centre = field, _checked_centre(centre)
+        self.field, self.centre = field, None if centre is None else _checked_centre(centre)
         if not isinstance(accuracy, Accuracy):
             raise TypeError(f"accuracy must be an optics.Accuracy, got {describe(accuracy)}. Use Accuracy(bands=12).")
         self.accuracy = replace(accuracy, **shortcuts)
@@ -424,14 +424,18 @@ class Imaging(Stage):
         """Whether the PSF varies over the picture."""
         return isinstance(self.lens, FieldSource) and self.field is not False and self.accuracy.blur
 
+    @property
+    def _middle(self) -> tuple[float, float]:
+        return self.centre or (0.0, 0.0)
+
     def _over_field(
         self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
     ) -> FieldPSFs:
         """PSFs of all places of a picture."""
-        assert isinstance(self.lens, FieldSource)
+        lens: Any = self.lens  # which `varies` has made sure of
         half = (self.pixel_pitch * n / 2 for n in picture[::-1])
-        corner = math.hypot(*(abs(c) + side for c, side in zip(self.centre, half, strict=True)))
-        return self.lens.over_field(corner, vergences, self._psf_wavelengths(wavelengths), mixing=mixing)
+        corner = math.hypot(*(abs(c) + side for c, side in zip(self._middle, half, strict=True)))
+        return lens.over_field(corner, vergences, self._psf_wavelengths(wavelengths), mixing=mixing)
 
     def _field_picture(
         self, scene: Scene, *, vergences: Tensor, window: tuple[int, int], weights: Tensor | None, like: Tensor
@@ -453,7 +457,7 @@ class Imaging(Stage):
 
         pixels, spacing = self.pixels(window, like), self.accuracy.spacing
         whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
-        return FieldPicture(psfs, pixels, self.centre, render, self.border, spacing, whole)
+        return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole)
 
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
         """What a picture over the field will be off by; as it is with `forward`'s arguments. Raises: ValueError for

@@ -138,6 +138,9 @@ class FieldPSFs(Protocol):
     def undistorted(self, places: Tensor) -> Tensor:
         """Where a lens without distortion would bring what falls at places (..., 2) [m]."""
 
+    def illumination(self, places: Tensor) -> Tensor:
+        """About the irradiance of an even scene at places (..., 2) [m], over that on the axis: a smooth curve > 0."""
+
     def deviations(self, pixels: PixelGrid) -> dict[str, float]:
         """What PSFs may be off by, of their light: pupils, colours, sampling, outside; see `field.FieldEstimate`."""
 

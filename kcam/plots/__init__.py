@@ -1,6 +1,7 @@
 """Figures of pictures and PSFs, and pictures as files."""
 
 from kcam.plots.contact_sheet import contact_sheet
+from kcam.plots.lens import field_figure, lens_figure, lens_text, opd_figure, section_figure, spot_figure
 from kcam.plots.pictures import (
     CHANNEL_COLOURS,
     PICTURE_SUFFIXES,
@@ -43,7 +44,8 @@ from kcam.plots.tradeoff import KNOB_COLOURS, tradeoff_figure
 __all__ = [
     "CHANNEL_COLOURS", "CURVE_COLOURS", "FAINT", "FIGURE_SUFFIXES", "INK", "KNOB_COLOURS", "LABEL", "MUTED",
     "PICTURE_SUFFIXES", "SHARE_SHOWN", "SMALL", "TITLE", "Sheet", "as_image", "centre", "check_writable",
-    "contact_sheet", "distance_colours", "duration", "false_colour", "figure_bytes", "light_colours", "metres",
-    "mosaic_tile", "optics_text", "percent_or_more", "pipeline_figure", "psf_figure", "psf_image", "quiet",
-    "reach_of", "save_figure", "tradeoff_figure", "write_picture",
+    "contact_sheet", "distance_colours", "duration", "false_colour", "field_figure", "figure_bytes", "lens_figure",
+    "lens_text", "light_colours", "metres", "mosaic_tile", "opd_figure", "optics_text", "percent_or_more",
+    "pipeline_figure", "psf_figure", "psf_image", "quiet", "reach_of", "save_figure", "section_figure", "spot_figure",
+    "tradeoff_figure", "write_picture",
 ]  # fmt: skip

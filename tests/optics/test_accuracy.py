@@ -49,6 +49,7 @@ def random_settings(draw: Draw) -> dict[str, typing.Any]:
         "max_memory": 1e6,
         "tile": draw.one_of(5, 8, 12),
         "direct": True,
+        "spacing": draw.one_of(8, 64),
     }
     assert every.keys() == {field.name for field in fields(optics.Accuracy)}
     return {name: value for name, value in every.items() if draw.number(0, 1) < 0.4}

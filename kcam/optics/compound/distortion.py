@@ -1,10 +1,8 @@
-"""Where light falls without distortion: the height of an object point as a polynomial of its image's.
-
-h(r) = r sum_k c_k T_k(2 (r / R)^2 - 1),   r = |place on the sensor| <= R
-"""
+"""Functions of the distance from the axis: where light falls without distortion, and how much of it there is."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -17,28 +15,40 @@ NODES = 16
 
 
 @dataclass(frozen=True)
-class ImageHeights:
-    """From places on the sensor back to object points. coefficients (K,) [1/m]; reach: R [m]; scale: of a point near
-    the axis, its image's height over its own [m], > 0.
-    """
+class Even:
+    """sum_k c_k T_k(2 (r / R)^2 - 1): a function of the distance r from the axis, even and smooth, up to r = R."""
 
     coefficients: Tensor
     reach: float
-    scale: Tensor
 
     @classmethod
-    def through(cls, heights: Tensor, radii: Tensor, scale: Tensor) -> ImageHeights:
-        """That of points (n,) whose images lie at radii (n,) [m], nearly the Chebyshev points of a range from 0."""
-        reach = float(radii.detach().max())
-        terms = chebyshev(2 * (radii / reach) ** 2 - 1, len(radii) - 1)
-        found = torch.linalg.solve(terms.T, heights / radii)
+    def through(cls, values: Tensor, radii: Tensor, *, reach: float) -> Even:
+        """That of values (n,) at radii (n,) [m], nearly the Chebyshev points of a range from 0."""
+        found = torch.linalg.solve(chebyshev(2 * (radii / reach) ** 2 - 1, len(radii) - 1).T, values)
         significant = (found.detach().abs() > _SMALL * found.detach().abs().sum()).nonzero()
-        return cls(found[: int(significant.max()) + 1], reach, scale)
+        return cls(found[: int(significant.max()) + 1], reach)
 
-    def over_radius(self, squared_radii: Tensor) -> Tensor:
-        """h / r [1/m] at squared radii [m^2]."""
+    def at(self, squared_radii: Tensor) -> Tensor:
+        """At squared radii [m^2]."""
         v = (2 / self.reach**2) * squared_radii - 1
         after, last = torch.zeros_like(v), torch.zeros_like(v)
         for coefficient in self.coefficients.flip(0)[:-1]:  # Clenshaw's recurrence
             after, last = coefficient + 2 * v * after - last, after
         return self.coefficients[0] + v * after - last
+
+
+def chebyshev_radii(reach: float) -> Tensor:
+    """Where to know an `Even` function, (n,)."""
+    return reach * torch.cos((torch.arange(NODES, dtype=torch.float64) + 0.5) * (math.pi / (2 * NODES)))
+
+
+@dataclass(frozen=True)
+class ImageHeights:
+    """From places on the sensor back to object points.
+
+    over_radius: their height over that of the image [1/m]. scale: of a point near the axis, its image's height over its
+    own [m], > 0.
+    """
+
+    over_radius: Even
+    scale: Tensor

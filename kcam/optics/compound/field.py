@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from kcam.optics.compound.distortion import ImageHeights
+from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
 from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, images
 from kcam.optics.compound.pupil import PupilFit
 from kcam.optics.compound.table import PupilTable, lagrange_weights
@@ -59,10 +59,11 @@ class FieldPSFs:
     mixing: Tensor | None = None  # (M, L): what a picture adds up of the wavelengths' PSFs; None: each is seen
 
     kept: dict[PixelGrid, tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
+    kept_curves: dict[str, Even] = field(default_factory=dict, repr=False)
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
-        heights = torch.cat([radii * self.image_heights.over_radius(radii**2), radii.new_zeros(1)])
+        heights = torch.cat([radii * self.image_heights.over_radius.at(radii**2), radii.new_zeros(1)])
         grid = torch.meshgrid(heights, self.vergences, wavelengths, indexing="ij")
         return self.table.at(*(part.flatten() for part in grid))
 
@@ -133,7 +134,7 @@ class FieldPSFs:
         psfs = self.bank(places, pixels)
         radii = places.norm(dim=1)
         fitted = self._fitted(radii, self.wavelengths)
-        frame = Frame.of(fitted, radii.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2))
+        frame = Frame.upright(fitted)
         light = areas(fitted, frame).view(3, len(self.vergences), -1)
         lost = 1 - psfs.sum((-2, -1)).double() / (light[:2] / light[2:])
         pupils = self.table.deviation + 2 * math.pi * float(
@@ -148,7 +149,21 @@ class FieldPSFs:
 
     def undistorted(self, places: Tensor) -> Tensor:
         """Where a lens without distortion would bring what falls at places (..., 2) [m]."""
-        return places * (self.image_heights.scale * self.image_heights.over_radius(places.square().sum(-1)))[..., None]
+        magnified = self.image_heights.scale * self.image_heights.over_radius.at(places.square().sum(-1))
+        return places * magnified[..., None]
+
+    def illumination(self, places: Tensor) -> Tensor:
+        """Irradiance of an even scene at places (..., 2) [m], over that on the axis: at the middle wavelength and
+        vergence, by a smooth curve, as what varies is to be divided out.
+        """
+        if "illumination" not in self.kept_curves:
+            radii = chebyshev_radii(max(self.reach, 1e-9))
+            middle = [part[len(part) // 2 : len(part) // 2 + 1] for part in (self.vergences, self.wavelengths)]
+            heights = torch.cat([radii * self.image_heights.over_radius.at(radii**2), radii.new_zeros(1)])
+            fitted = self.table.at(heights, *(part.expand(len(heights)) for part in middle))
+            light = areas(fitted, Frame.upright(fitted))
+            self.kept_curves["illumination"] = Even.through(light[:-1] / light[-1], radii, reach=max(self.reach, 1e-9))
+        return self.kept_curves["illumination"].at(places.square().sum(-1))
 
     @torch.no_grad()
     def blur(self) -> float:
@@ -179,6 +194,6 @@ class FieldPSFs:
         """How far shares of the light of some nodes fall from where they should [m], and the areas of their pupils."""
         radii = torch.linspace(0, self.reach, _LOOKED if self.reach else 1, dtype=torch.float64)
         fitted = self._fitted(radii, self.wavelengths)
-        frame = Frame.of(fitted, radii.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2))
+        frame = Frame.upright(fitted)
         own = torch.cat([radii, radii.new_zeros(1)]).repeat_interleave(len(self.vergences) * len(self.wavelengths))
         return frame.slopes + (fitted.chief + own).abs()[:, None], areas(fitted, frame)

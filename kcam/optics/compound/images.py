@@ -70,6 +70,11 @@ class Frame:
         parts = [_looked(fitted, own, directions[own]) for own in nodes.split(max(1, _AT_ONCE // (8 * _LOOK**2)))]
         return cls(directions, *(torch.cat(part) for part in zip(*parts, strict=True)))
 
+    @classmethod
+    def upright(cls, fitted: PupilFit) -> Frame:
+        """Seen with the meridional plane along y: middle[:, 1] and half are about dy."""
+        return cls.of(fitted, fitted.centre.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2))
+
     def __getitem__(self, index: Tensor) -> Frame:
         own = (part[index] for part in (self.directions, self.middle, self.half, self.slope, self.slopes))
         return Frame(*own)

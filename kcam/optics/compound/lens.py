@@ -6,13 +6,14 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from kcam.inputs import as_values
-from kcam.optics.compound import pupil
-from kcam.optics.compound.distortion import NODES, ImageHeights
+from kcam.optics.compound import analysis, pupil
+from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
 from kcam.optics.compound.field import FieldPSFs, bank
 from kcam.optics.compound.files import read_lens, write_lens
 from kcam.optics.compound.images import Frame, areas
@@ -21,10 +22,14 @@ from kcam.optics.compound.surface import Surface
 from kcam.optics.compound.table import tabulate
 from kcam.optics.compound.tracing import Rays, system_matrix, trace
 from kcam.optics.elements.element import check_numbers, place_sensor
-from kcam.optics.numerics import Scalar, float64
+from kcam.optics.numerics import Scalar, float64, phasor, squared
 from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_WIDEST, _INTERVALS, _NESTED = 60.0, 16, 4  # degrees; of a search for the edge of the field
 _AIMING = 10  # steps of the secant that aims a chief ray
 _AIMING_EACH = 60  # at most, of a ray to its point of the stop: a phone's, on a steep stop, takes some 40
 
@@ -328,7 +333,7 @@ class CompoundLens(nn.Module):
         asked = self._asked([self.focus_wavelength] if wavelengths is None else wavelengths, distances, field)
         heights = torch.cat([asked.heights.new_zeros(1), asked.heights])
         fitted = self.pupils(asked.wavelengths, asked.vergences, heights)
-        found = areas(fitted, Frame.of(fitted, heights.new_tensor([[0.0, 1.0]]).expand(len(fitted.centre), 2)))
+        found = areas(fitted, Frame.upright(fitted))
         found = found.view(len(heights), -1)
         return (found[1:] / found[:1]).mean(1)
 
@@ -394,7 +399,7 @@ class CompoundLens(nn.Module):
         with torch.no_grad():
             zero = torch.zeros(1, dtype=torch.float64)
             fitted = self.pupils(wavelength_grid([self.focus_wavelength]), zero + self._focus(), zero)
-            area = areas(fitted, Frame.of(fitted, torch.tensor([[0.0, 1.0]], dtype=torch.float64)))
+            area = areas(fitted, Frame.upright(fitted))
         return float(area) * float(self.sensor_distance) ** 2
 
     def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
@@ -449,9 +454,10 @@ class CompoundLens(nn.Module):
                 raise ValueError(
                     f"the sensor reaches {reach * 1e3:.3g} mm from the axis, beyond the field of this lens: {error}"
                 ) from error
-            angles = (torch.arange(NODES, dtype=torch.float64) + 0.5) * (math.pi / (2 * NODES))
-        heights = highest * torch.cos(angles)
-        return ImageHeights.through(heights, landed(heights), scale)
+        heights = chebyshev_radii(1.0) * highest
+        radii = landed(heights)
+        over_radius = Even.through(heights / radii, radii, reach=float(radii.detach().max()))
+        return ImageHeights(over_radius, scale)
 
     def over_field(
         self, reach: float, vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
@@ -462,7 +468,7 @@ class CompoundLens(nn.Module):
         self.check()
         heights = self.image_heights(max(reach, 1e-9))
         square = torch.tensor(reach, dtype=torch.float64) ** 2
-        highest = reach * float(heights.over_radius(square).detach())
+        highest = reach * float(heights.over_radius.at(square).detach())
         table = tabulate(
             lambda t, v, colours: self.pupils(colours, v, t),
             highest=highest,
@@ -481,6 +487,298 @@ class CompoundLens(nn.Module):
         heights = points.square().sum(1).clamp(min=1e-300).sqrt() * (points != 0).any(1)
         away = torch.where(heights[:, None] > 0, points / heights.clamp(min=1e-150)[:, None], points.new_tensor([0, 1]))
         return _Asked(wavelength_grid(wavelengths), 1 / check_distances(distances).reshape(-1), heights, away)
+
+    # ---- analysis --------------------------------------------------------------------------------------------------
+
+    def mtf(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        pixel_pitch: float,
+        shape: tuple[int, int],
+        field: Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+        integrate: bool = True,
+    ) -> Tensor:
+        """Modulation transfer function, |OTF| / OTF(0), times the pixel's own sinc.
+
+        Args: those of `psf`; integrate=False leaves out the pixel's sinc: the optics alone.
+        Returns: (F, Z, L, H, W) in [0, 1], without `field` (Z, L, H, W); index n // 2 is frequency 0, the step is
+            1 / (n * pixel_pitch) cycles per metre. Frequencies lie on the sensor's axes, +x right and +y down: for a
+            point above or below the axis those along W are sagittal and those along H tangential, for one beside it the
+            other way round; `modulation` has both at any point.
+        Raises: as `psf`.
+        Of all light but diffraction far outside the window, which counts for a share of less than 5e-3.
+        """
+        asked = self._asked(wavelengths, distances, field)
+        pixels = PixelGrid(check_pixel_pitch(pixel_pitch), shape, integrate=integrate, dtype=dtype)
+        fitted = self.pupils(asked.wavelengths, asked.vergences, asked.heights)
+        node = torch.arange(len(fitted.centre)).view(len(asked.heights), len(asked.vergences), -1)
+        maps = [
+            analysis.modulation_map(
+                fitted,
+                int(node[f, z, k]),
+                direction=direction,
+                wavelength=wavelength,
+                pixel_pitch=pixels.pitch,
+                shape=pixels.shape,
+            )
+            for f, direction in enumerate(asked.directions)
+            for z in range(len(asked.vergences))
+            for k, wavelength in enumerate(asked.wavelengths.tolist())
+        ]
+        found = torch.stack(maps).view(*node.shape, *pixels.shape)
+        if integrate:
+            rows, columns = (torch.sinc((torch.arange(n, dtype=torch.float64) - n // 2) / n) for n in pixels.shape)
+            found = found * rows[:, None] * columns
+        return (found if field is not None else found[0]).to(dtype)
+
+    def modulation(
+        self,
+        frequencies: Tensor | Sequence[float],
+        *,
+        wavelengths: Tensor | list[float] | None = None,
+        distance: float = math.inf,
+        field: Tensor,
+    ) -> Tensor:
+        """MTF of all wavelengths together, each with the same energy, and without pixels: sagittal and tangential.
+
+        Args:
+            frequencies: (K,) >= 0 [cycles per metre]: 30 line pairs per mm are 30 / mm.
+            wavelengths: (L,) [m], None for those of `analysis.SPECTRAL_LINES`. distance: of the object [m].
+            field: (F, 2) of object points.
+        Returns: (F, 2, K) in [0, 1]: of sagittal lines, which run along the direction in which the point's image lies
+            from the axis, so that their frequency is across it, and of tangential ones; on the axis, in x and in y.
+        Raises: ValueError for frequencies that are negative or not finite; as `psf`.
+        """
+        lines = as_values(frequencies, name="frequencies", unit="cycles per metre").to(torch.float64).reshape(-1)
+        if not bool((lines.isfinite() & (lines >= 0)).all()):
+            raise ValueError(
+                f"frequencies must be finite and >= 0 cycles per metre, got {lines.tolist()}. 30 line pairs per mm are "
+                "30 / mm."
+            )
+        asked = self._asked(self._colours(wavelengths), distance, field)
+        fitted = self.pupils(torch.cat([asked.wavelengths, self._focus_line()]), asked.vergences, asked.heights)
+        node = torch.arange(len(fitted.centre)).view(len(asked.heights), -1)
+        found = []
+        for own in node:
+            offsets = fitted.chief[own[:-1]] - fitted.chief[own[-1]]
+            parts = [
+                analysis.transfer(fitted, int(index), lines, wavelength=wavelength)
+                # lateral colour moves the light of a wavelength along the meridian
+                * torch.stack([torch.ones_like(lines) + 0j, phasor(-2 * math.pi * lines * offset)])
+                for index, wavelength, offset in zip(own, asked.wavelengths.tolist(), offsets, strict=False)
+            ]
+            found.append(torch.stack(parts).mean(0))
+        # a floor far below rounding: no NaN gradient at the zeros of an MTF
+        return torch.sqrt(squared(torch.stack(found)) + torch.finfo(torch.float64).tiny)
+
+    def spots(
+        self,
+        wavelengths: Tensor | list[float],
+        *,
+        distances: Tensor | float,
+        field: Tensor | None = None,
+        rings: int = 12,
+    ) -> tuple[Tensor, Tensor]:
+        """Where rays land, relative to the chief ray of the focus wavelength, and the light that each carries.
+
+        Args: as of `psf`; rings: of rays over the stop and a little beyond, R = 1 + 3 rings (rings + 1).
+        Returns: points (F, Z, L, R, 2) [m] on the sensor's axes; weights (F, Z, L, R) that sum to the relative
+            illumination, to 2 %: 0 for rays that do not pass, a part for those at an edge, and more where rays
+            stand farther apart as seen from the image. Without `field` (Z, L, R, 2) and (Z, L, R).
+        Raises: ValueError for a point of which no ray passes, and as `psf`.
+        """
+        asked = self._asked(wavelengths, distances, field)
+        points, _, weights = self._landed(asked, rings)
+        return (points, weights) if field is not None else (points[0], weights[0])
+
+    def refocus(
+        self,
+        criterion: str = "rms",
+        *,
+        field: Tensor | None = None,
+        distance: float = math.inf,
+        wavelengths: Tensor | list[float] | None = None,
+        weights: Tensor | None = None,
+    ) -> CompoundLens:
+        """The same lens with its sensor where spots are least: a new lens of the same surfaces, which are shared.
+
+        Rays that pass go straight on, so the mean squared radius about the centroid is a quadratic in the sensor's
+        distance, and the best is exact, for the rays that are there.
+
+        Args:
+            criterion: "rms": the sum over fields of the mean squared radius of their spots, of all wavelengths and all
+                light that passes.
+            field: (F, 2) of object points, None for the axis. distance: of the object [m].
+            wavelengths: (L,) [m], None for those of `analysis.SPECTRAL_LINES`.
+            weights: (F, L), what each field and wavelength counts; None: all alike.
+        Returns: a lens whose `sensor_distance` is a number, or a new Parameter where it was one.
+        Raises: ValueError for an unknown criterion, weights that are negative, all 0 or of another shape, a best focus
+            that is not behind the lens, and as `spots`.
+        """
+        if criterion not in analysis.CRITERIA:
+            raise ValueError(f"unknown criterion {criterion!r}; known: {', '.join(analysis.CRITERIA)}.")
+        asked = self._asked(self._colours(wavelengths), distance, field)
+        counts = torch.ones(len(asked.heights), len(asked.wavelengths), dtype=torch.float64)
+        if weights is not None:
+            given = as_values(weights, name="weights", unit="of each field and wavelength").to(torch.float64)
+            if given.shape != counts.shape or not bool((given >= 0).all() and (given.sum(1) > 0).any()):
+                raise ValueError(
+                    f"weights must be {tuple(counts.shape)} for fields and wavelengths, >= 0 and not all 0, got shape "
+                    f"{tuple(given.shape)}."
+                )
+            counts = given
+        with torch.no_grad():
+            points, slopes, light = (part[:, 0] for part in self._landed(asked, rings=24))
+            light = light / light.sum(-1, keepdim=True) * counts[..., None]
+            lit = counts.sum(1) > 0
+            shift = analysis.sharpest(*(part[lit].flatten(1, 2) for part in (points, slopes, light)))
+            best = float(float64(self.sensor_distance).detach()) + shift
+        if best <= 0:
+            raise ValueError(f"the best focus is {-best:g} m inside the lens, not behind it: focus farther away.")
+        trained = isinstance(self.sensor_distance, nn.Parameter)
+        placed = nn.Parameter(torch.full_like(self.sensor_distance, best)) if trained else best  # type: ignore[arg-type]
+        arguments = self.configuration() | {"sensor_distance": placed}
+        del arguments["surfaces"]
+        return type(self)(*self.surfaces, **arguments)  # type: ignore[arg-type]
+
+    def field_limit(self, *, least: float = 0.2, distance: float = math.inf) -> float:
+        """Largest height Y / D up to which the relative illumination is above `least` and chief rays pass: by nested
+        intervals of the angle, to 0.001 degrees; that of 60 degrees where they do so up to there.
+        """
+        self.check()
+        vergences = 1 / check_distances(distance).reshape(-1)
+        indices = [index[None, None, :, None] for index in self.indices(self._focus_line())]
+        low, high = 0.0, math.radians(_WIDEST)
+        with torch.no_grad():
+            for _ in range(_NESTED):
+                angles = torch.linspace(low, high, _INTERVALS + 1, dtype=torch.float64)
+                heights = torch.cat([angles.new_zeros(1), angles.tan()])
+                t, v = heights[:, None, None, None], vergences[None, :, None, None]
+                aim, across, along = self.aimed(t, v, indices)
+                chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
+                light = self._sent(_Nodes(indices, t, v, aim, across, along, chief), rings=8)[1].sum(-1)[:, 0, 0]
+                passes = chief.alive[:, 0, 0, 0] & (light > least * light[0])
+                fails = torch.nonzero(~passes[1:])
+                if not len(fails):
+                    return math.tan(high)
+                first = int(fails[0])
+                low, high = float(angles[max(first - 1, 0)]), float(angles[first])
+        return math.tan(low)
+
+    def field_curves(
+        self,
+        heights: Tensor | list[float] | None = None,
+        *,
+        wavelengths: Tensor | list[float] | None = None,
+        distance: float = math.inf,
+        frequencies: Tensor | Sequence[float] = (10e3, 30e3),
+    ) -> analysis.FieldCurves:
+        """What this lens does over its field, in numbers.
+
+        Args: heights: Y / D of object points (F,); None for 11 up to `field_limit`. The others as of `modulation`.
+        Raises: as `modulation` and `relative_illumination`.
+        """
+        if heights is None:
+            heights = torch.linspace(0, self.field_limit(distance=distance), 11, dtype=torch.float64)
+        field = analysis.upwards(heights)
+        grid = self._colours(wavelengths)
+        landed = self.image_point(torch.cat([grid, self._focus_line()]), distances=distance, field=field)[:, 0, :, 1]
+        points, weights = self.spots(grid, distances=distance, field=field)
+        return analysis.FieldCurves(
+            heights=field[:, 1],
+            image_heights=landed[:, -1].abs(),
+            relative_illumination=self.relative_illumination(field, distances=distance),
+            distortion=self.distortion(field, distance=distance),
+            lateral_colour=landed[:, -1:] - landed[:, :-1],
+            rms_spot=analysis.rms_radius(points.flatten(1, 3), weights.flatten(1, 3)),
+            mtf=self.modulation(frequencies, wavelengths=grid, distance=distance, field=field),
+            wavelengths=grid,
+            frequencies=torch.as_tensor(frequencies, dtype=torch.float64),
+        )
+
+    def paths(
+        self, heights: Tensor | list[float], *, distance: float = math.inf, count: int = 7, lead: float = 5e-3
+    ) -> Tensor:
+        """Rays in the plane of the axis that pass, for a drawing: (F, count, K + 3, 2) of z and y [m].
+
+        From `lead` in front of the first vertex, where z = 0, to each of K surfaces and to the sensor, at the focus
+        wavelength; evenly from one edge of what passes to the other.
+        Raises: ValueError for a point of which no ray passes.
+        """
+        asked = self._asked([self.focus_wavelength], distance, analysis.upwards(heights))
+        with torch.no_grad():
+            nodes = self._nodes(asked.wavelengths, asked.vergences, asked.heights)
+            semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+            across = torch.linspace(-1.2, 1.2, 241, dtype=torch.float64) * semi / nodes.along.abs()
+            rays = self.launch(nodes.heights, nodes.vergences, torch.zeros_like(across), nodes.aim + across)
+            landed = self._at_sensor(rays, nodes.indices)
+            passes = landed.alive & (torch.stack(landed.clearance) > 0).all(0)
+            kept = analysis.evenly(passes[:, 0, 0], count)
+            started = rays.y - lead * rays.dy / rays.dz
+            vertex, points = torch.zeros((), dtype=torch.float64), [torch.stack([0 * rays.y - lead, started], -1)]
+            for k, surface in enumerate(self.surfaces):
+                y = trace(self.surfaces, rays, nodes.indices, until=k).y
+                points.append(torch.stack([vertex + surface.sag(y**2)[0], y], -1))
+                behind = self.sensor_distance if k == len(self.surfaces) - 1 else surface.thickness
+                vertex = vertex + float64(behind)
+            points.append(torch.stack([vertex + 0 * rays.y, landed.y], -1))
+            found = torch.stack(points, dim=-2)[:, 0, 0]
+        return torch.gather(found, 1, kept[:, :, None, None].expand(-1, -1, *found.shape[2:]))
+
+    def draw(self, path: str | os.PathLike[str] | None = None) -> Figure:
+        """The lens in section, with rays of three points of its field; written to `path` if there is one.
+
+        Raises: ValueError for a file that cannot be written, and as `paths`.
+        """
+        from kcam import plots  # figures are made of lenses
+
+        figure = plots.section_figure(self)
+        if path is not None:
+            plots.save_figure(figure, path)
+        return figure
+
+    def _colours(self, wavelengths: Tensor | list[float] | None) -> Tensor:
+        return wavelength_grid(list(analysis.SPECTRAL_LINES) if wavelengths is None else wavelengths)
+
+    def _focus_line(self) -> Tensor:
+        return wavelength_grid([self.focus_wavelength])
+
+    def _sent(self, nodes: _Nodes, rings: int) -> tuple[Rays, Tensor]:
+        """Rays over the stop, at the sensor, and the light of each, (F, Z, L, R): see `analysis.light`."""
+        x, y, area = analysis.hexapolar(rings)
+        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        beside = analysis.STEP * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        x, y = (part + step[:, None, None, None, None] for part, step in zip((x, y), beside, strict=True))
+        px, py = x * (semi / nodes.across.abs()), nodes.aim + y * (semi / nodes.along.abs())
+        rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
+        return analysis.first(rays), analysis.light(rays, area)
+
+    def _landed(self, asked: _Asked, rings: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Points [m] and slopes of rays on the sensor's axes (F, Z, L, R, 2), and their light (F, Z, L, R)."""
+        nodes = self._nodes(
+            torch.cat([asked.wavelengths, self._focus_line()]),
+            asked.vergences,
+            torch.cat([asked.heights, asked.heights.new_zeros(1)]),
+        )
+        rays, light = self._sent(nodes, rings)
+        whole = light.sum(-1, keepdim=True)
+        if not bool((whole > 0).all()):
+            height = float(asked.heights[(whole[:-1] <= 0).flatten(1).any(1)].max())
+            raise ValueError(
+                f"no ray of a point at {height:.3g} (Y / D) passes this lens. Use smaller fields, or a larger "
+                "semi_diameter."
+            )
+        cx, cy = (part[:, None, None, None] for part in asked.directions.unbind(1))
+
+        def on_sensor(x: Tensor, y: Tensor) -> Tensor:
+            x, y = x[:-1, :, :-1], y[:-1, :, :-1]
+            return torch.stack([x * cy + y * cx, y * cy - x * cx], dim=-1)
+
+        points = on_sensor(rays.x, rays.y - nodes.chief.y[:, :, -1:])
+        return points, on_sensor(rays.dx / rays.dz, rays.dy / rays.dz), light[:-1, :, :-1] / whole[-1:, :, :-1]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The pupil of a real lens, seen from one point of the image: wavefront and clearances over direction cosines.
 
-    W(dx, dy) = sum_ij w_ij T_2i(u) T_j(v),   q_s(dx, dy) likewise,   u = dx / r, v = (dy - c) / r
+    W(dx, dy) = sum_ij w_ij T_2i(u) T_j(v),   q_s(dx, dy) likewise,   u = dx / a, v = (dy - c) / b
 
 fitted to exact rays. In the direction cosines towards the sensor the Fourier kernel is straight at every field angle,
 and a uniform radiance is uniform, so that illumination is an area. Light passes where every clearance q is above 0.
@@ -31,9 +31,9 @@ _RINGS, _SPOKES = 21, 49
 class PupilFit:
     """Pupils of N nodes as polynomials.
 
-    degree: of the polynomials. centre (N,), half_width (N, 2): of the direction cosine dy, of dx and dy, within which
-    there are rays; r is the larger. wavefront: coefficients (N, T) [m]. clearances: (N, S, T). chief: where the chief
-    ray lands, (N,) [m]. residual: rms of the fit of the wavefront within the open part, (N,) [m].
+    degree: of the polynomials. centre (N,): c; half_width (N, 2): a and b, within which there are rays. wavefront:
+    coefficients (N, T) [m]. clearances: (N, S, T). chief: where the chief ray lands, (N,) [m]. residual: rms of the fit
+    of the wavefront within the open part, (N,) [m].
     """
 
     degree: int
@@ -46,8 +46,13 @@ class PupilFit:
 
     @property
     def radius(self) -> Tensor:
-        """r (N,)."""
+        """The larger half width, (N,)."""
         return self.half_width.amax(1)
+
+    def one(self, node: int) -> PupilFit:
+        """One of the nodes, by itself."""
+        parts = {name: value[node : node + 1] for name, value in vars(self).items() if name != "degree"}
+        return PupilFit(self.degree, **parts)
 
     def at(self, node: int | Tensor, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
         """Wavefront (...) [m] and clearances (S + 1, ...) at direction cosines of one node's meridional plane; of nodes
@@ -57,14 +62,16 @@ class PupilFit:
             wavefront, clearances = self.at(torch.tensor([node]), dx[None], dy[None])
             return wavefront[0], clearances[0]
         shape = (-1, *[1] * (dx.ndim - 1))
-        r, off = self.radius[node].view(shape), dy - self.centre[node].view(shape)
-        across, along = chebyshev(dx / r, self.degree)[::2], chebyshev(off / r, self.degree)
-        rows, columns = _orders(self.degree)
-        table = torch.cat([self.wavefront[node][:, None], self.clearances[node]], dim=1)
-        values = torch.einsum("nst,tn...->ns...", table, along[rows] * across[columns])
-        # beyond the rays nothing is known, and nothing open
         a, b = (part.view(shape) for part in self.half_width[node].unbind(1))
-        inside = 1 - (dx / a) ** 2 - (off / b) ** 2
+        u, v = dx / a, (dy - self.centre[node].view(shape)) / b
+        across, along = chebyshev(u, self.degree)[::2], chebyshev(v, self.degree)
+        table = torch.cat([self.wavefront[node][:, None], self.clearances[node]], dim=1)
+        full = table.new_zeros(*table.shape[:2], self.degree + 1, self.degree // 2 + 1)
+        rows, columns = _orders(self.degree)
+        full[:, :, rows, columns] = table
+        values = torch.einsum("nsji,jn...,in...->ns...", full, along, across)
+        # beyond the rays nothing is known, and nothing open
+        inside = 1 - u**2 - v**2
         return values[:, 0], torch.cat([values[:, 1:], inside[:, None]], dim=1)
 
 
@@ -117,13 +124,13 @@ def fit(
         weights = torch.exp(_LESS * least.clamp(max=0)).clamp(min=1e-3) * alive
         low, high = torch.where(alive, dy, math.inf).amin(1), torch.where(alive, dy, -math.inf).amax(1)
         half = torch.stack([torch.where(alive, dx.abs(), 0.0).amax(1), (high - low) / 2], dim=1).clamp(min=1e-9)
-        centre, radius = (low + high) / 2, half.amax(1, keepdim=True)
+        centre = (low + high) / 2
         others = least[:, None].expand_as(clearances)  # surfaces that clip nothing that the rest lets pass are left out
         clips = ((clearances <= others + 1e-12) & (others < 0.02) & (others > -0.3)).any(0).any(1)
     clearances = clearances[:, clips]
     for degree in DEGREES:
         rows, columns = _orders(degree)
-        u, v = dx / radius, (dy - centre[:, None]) / radius
+        u, v = dx / half[:, :1], (dy - centre[:, None]) / half[:, 1:]
         terms = (chebyshev(v, degree)[rows] * chebyshev(u, degree)[::2][columns]).movedim(0, -1)
         data = torch.cat([wavefront[:, None], clearances], dim=1).mT
         q, r = torch.linalg.qr(terms * weights[..., None])

@@ -145,9 +145,7 @@ def difference(first: PupilFit, second: PupilFit, wavelengths: Tensor) -> Tensor
     count = both.sum((1, 2)).clamp(min=1)[:, None, None]
     off = torch.where(both, off - off.sum((1, 2), keepdim=True) / count, 0.0)
     phase = 2 * math.pi * (off.square().sum((1, 2)) / count[:, 0, 0]).sqrt() / wavelengths
-    upright = torch.zeros(len(nodes), 2, dtype=torch.float64)
-    upright[:, 1] = 1
-    one, two = (areas(fitted, Frame.of(fitted, upright)) for fitted in (first, second))
+    one, two = (areas(fitted, Frame.upright(fitted)) for fitted in (first, second))
     return phase + (two / one - 1).abs()
 
 

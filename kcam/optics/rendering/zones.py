@@ -74,22 +74,21 @@ def blend(
         banks = bank(places).unflatten(0, (len(pair), -1))
         lights = []
         for row, psfs in zip(pair, banks, strict=True):
-            light: Tensor | None = None
+            light = planes.new_zeros(())
             for column, psf in enumerate(psfs):
                 zone = _Zone(rows, columns, row, column, window)
                 own, part = zone.cut(planes), None if shares is None else zone.cut_shares(shares)
                 margin = [0, 0] if shares is None else [m - 1 for m in window]
                 found = render(psf, torch.nn.functional.pad(own, [margin[1], margin[1], margin[0], margin[0]]), part)
                 found = found[..., margin[0] : found.shape[-2] - margin[0], margin[1] : found.shape[-1] - margin[1]]
-                if light is None:
+                if not column:
                     light = found.new_zeros(*found.shape[:-1], width + 2 * (window[1] - 1))
                 left = columns.first[column]
                 light[..., left : left + found.shape[-1]] += found
-            assert light is not None
             lights.append(light[..., window[1] - 1 : window[1] - 1 + width])
         return lights
 
-    result: Tensor | None = None
+    result = planes.new_zeros(())
     count = len(rows.nodes)
     for first in range((count + 1) // 2):
         pair = sorted({first, count - 1 - first})
@@ -98,12 +97,11 @@ def blend(
         else:
             lights = strips(planes, shares, pair)
         for row, light in zip(pair, lights, strict=True):
-            if result is None:
+            if not result.ndim:
                 result = light.new_zeros(*light.shape[:-2], height, width)
             top = rows.first[row] - (window[0] - 1)  # of the picture
             cut = slice(max(0, -top), min(light.shape[-2], height - top))
             result[..., top + cut.start : top + cut.stop, :] += light[..., cut, :]
-    assert result is not None
     return result
 
 

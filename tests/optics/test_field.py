@@ -1,0 +1,272 @@
+"""Pictures over the field of a real lens: where light lands, how much, and with which PSF: one for each pixel."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from draws import Draw
+from torch import Tensor, nn
+
+from kcam import Camera, Scene, optics, sensor
+from kcam.optics.rendering.resampling import resampling
+from kcam.units import mm, nm, um
+
+DOUBLE = torch.float64
+LINES = torch.tensor([480 * nm, 550 * nm, 640 * nm], dtype=DOUBLE)
+
+
+def small(name: str = "cooke_triplet", scale: float = 0.1, *, stop: float = 1.0, **where) -> optics.CompoundLens:
+    """A preset at a tenth of its size: its whole field on few pixels."""
+    surfaces = [
+        optics.Surface(
+            radius=surface.radius * scale,
+            thickness=float(surface.thickness) * scale,
+            glass=surface.glass,
+            semi_diameter=float(surface.semi_diameter) * scale * (stop if surface.stop else 1),
+            stop=surface.stop,
+        )
+        for surface in optics.CompoundLens.preset(name).surfaces
+    ]
+    return optics.CompoundLens(*surfaces, **({"focus_distance": 1.0} | where))
+
+
+def scene_of(light: Tensor, depth: float | Tensor = 1.0) -> Scene:
+    return Scene.from_bands(light, wavelengths=LINES[: light.shape[1]], depth=depth)
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return Draw(seed).noise(*shape).double() if shape else torch.zeros(())
+
+
+# ---- distortion ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("border", ["reflect", "replicate", "periodic"])
+def test_an_even_scene_stays_even_under_distortion(border: str) -> None:
+    moves = resampling(lambda at: at * (1 + 3e-5 * at.square().sum(-1, keepdim=True)), (40, 61), border)
+    assert moves is not None
+    assert float((moves(torch.ones(1, 2, 40, 61)) - 1).abs().max()) < 1e-6
+
+
+def test_distortion_moves_light_where_it_belongs() -> None:
+    """The centre of a pixel's light, for barrel and cushion: to half a pixel times what columns are inclined by, 0.05
+    here; and what the scene's pixel covers is its light.
+    """
+    for strength in (4e-5, -4e-5):
+
+        def ideal(at: Tensor, strength: float = strength) -> Tensor:
+            return at * (1 + strength * at.square().sum(-1, keepdim=True))
+
+        moves = resampling(ideal, (61, 81), "zero")
+        assert moves is not None
+        y, x = (torch.arange(n, dtype=DOUBLE) - (n - 1) / 2 for n in (61, 81))
+        for row, column in ((30, 40), (8, 12), (50, 15), (20, 70)):
+            point = torch.zeros(1, 1, 61, 81, dtype=DOUBLE)
+            point[..., row, column] = 1
+            light = moves(point)[0, 0]
+            where = torch.stack([(light * x).sum(), (light * y[:, None]).sum()]) / light.sum()
+            assert float((ideal(where) - torch.tensor([x[column], y[row]])).norm()) < 0.03
+            middle = torch.tensor([x[column], y[row]], dtype=DOUBLE)
+            jacobian = torch.autograd.functional.jacobian(ideal, where)
+            assert float(light.sum() * jacobian.det()) == pytest.approx(1, rel=1e-2)
+            assert middle.isfinite().all()
+
+
+def test_what_is_not_moved_is_not_touched() -> None:
+    assert resampling(lambda at: at * (1 + 1e-6), (50, 50), "reflect") is None
+
+
+# ---- the whole picture ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("shape", "centre"), [((48, 64), None), ((31, 40), (0.7 * mm, -0.5 * mm))])
+def test_an_even_scene_gives_relative_illumination_without_seams(shape: tuple[int, int], centre) -> None:
+    lens = small()
+    imaging = optics.Imaging(
+        lens, pixel_pitch=40 * um if centre is None else 20 * um, centre=centre, border="replicate"
+    )
+    light = imaging(scene_of(torch.ones(1, 1, *shape, dtype=DOUBLE)))[0, 0]
+    psfs = imaging._over_field(shape, torch.ones(1, dtype=DOUBLE), LINES[:1])
+    rows, columns = ([0, n // 3, n // 2, n - 1] for n in shape)
+    y, x = torch.meshgrid(torch.tensor(rows), torch.tensor(columns), indexing="ij")
+    pitch, (height, width) = imaging.pixel_pitch, shape
+    middle = torch.tensor(centre or (0.0, 0.0), dtype=DOUBLE)
+    places = middle - torch.stack([x - (width - 1) / 2, y - (height - 1) / 2], -1).double().view(-1, 2) * pitch
+    field = -psfs.undistorted(places) / lens.image_scale  # light falls turned about
+    expected = lens.relative_illumination(field, wavelengths=LINES[:1], distances=1.0).view(4, 4)
+    assert float((light[y, x] / expected - 1).abs().max()) < 2e-3
+    assert float(light.diff(n=2, dim=-1).abs().max()) < 2e-3
+
+
+@pytest.mark.parametrize("centre", [None, (0.6 * mm, 0.4 * mm)])
+def test_a_point_anywhere_lands_at_its_image_point(centre) -> None:
+    lens, shape, pitch = small(), (75, 91), 12 * um
+    imaging = optics.Imaging(lens, pixel_pitch=pitch, centre=centre, border="zero", spacing=16)
+    y, x = (torch.arange(n, dtype=DOUBLE) - (n - 1) / 2 for n in shape)
+    middle = torch.tensor(centre or (0.0, 0.0), dtype=DOUBLE)
+    for row, column in ((37, 45), (20, 22), (60, 70)):
+        light = torch.zeros(1, 1, *shape, dtype=DOUBLE)
+        light[..., row, column] = 1
+        ideal = middle - torch.stack([x[column], y[row]]) * pitch
+        field = -ideal / lens.image_scale
+        lands = lens.image_point([550 * nm], distances=1.0, field=field[None])[0, 0, 0]
+        picture = imaging(Scene.from_bands(light, wavelengths=[550 * nm], depth=1.0))[0, 0]
+        found = torch.stack([(picture * x).sum(), (picture * y[:, None]).sum()]) / picture.sum()
+        psf = lens.psf([550 * nm], distances=1.0, pixel_pitch=pitch, shape=(61, 61), field=field[None], dtype=DOUBLE)[
+            0, 0, 0
+        ]
+        k = torch.arange(61, dtype=DOUBLE) - 30
+        own = torch.stack([(psf * k).sum(), (psf * k[:, None]).sum()]) / psf.sum()  # coma has a centre of its own
+        expected = (middle - lands) / pitch - own
+        assert float((found - expected).abs().max()) < 0.05
+
+
+def truth(imaging: optics.Imaging, light: Tensor, window: tuple[int, int]) -> Tensor:
+    """One PSF for each pixel of the scene that distortion has moved; dark beyond the picture."""
+    height, width = light.shape[-2:]
+    scene = scene_of(light)
+    weights = torch.eye(light.shape[1], dtype=DOUBLE)
+    field = imaging._field_picture(
+        scene, vergences=torch.ones(1, dtype=DOUBLE), window=window, weights=weights, like=light
+    )
+    planes, _ = field.moved(light, None)
+    y, x = (torch.arange(n, dtype=DOUBLE) - (n - 1) / 2 for n in (height, width))
+    m, n = (side // 2 for side in window)
+    picture = light.new_zeros(light.shape[1], height + 2 * m, width + 2 * n)
+    for row in range(height):
+        psfs = field.bank(torch.stack([x, y[row].expand(width)], -1))[:, 0].flip(-2, -1)
+        for column in range(width):
+            picture[:, row : row + window[0], column : column + window[1]] += (
+                psfs[column] * planes[0, :, row, column, None, None]
+            )
+    return picture[:, m : m + height, n : n + width]
+
+
+LENSES = [
+    ("cooke_triplet", 1.0, 45 * um),
+    ("ef50", 0.45, 60 * um),
+    ("tessar", 0.8, 60 * um),
+    ("wide_angle", 0.7, 30 * um),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "stop", "pitch"), [LENSES[0], *(pytest.param(*row, marks=pytest.mark.slow) for row in LENSES[1:])]
+)
+def test_a_picture_is_that_of_one_psf_for_each_pixel(name: str, stop: float, pitch: float) -> None:
+    """60 dB; the estimate is at least a third of the error, at any spacing."""
+    shape, window = (24, 32), (9, 9)
+    lens = small(name, stop=stop, focus_distance=0.3)
+    light = noise(1, 1, *shape, seed=1) ** 2
+    imaging = optics.Imaging(lens, pixel_pitch=pitch, border="zero", psf_shape=window)
+    expected = truth(imaging, light, window)
+    for spacing in (None, 16, 8):
+        own = imaging.changed(spacing=spacing)
+        off = own(scene_of(light))[0] - expected
+        rms = float(off.square().mean().sqrt())
+        estimate = own.explain(scene_of(light))
+        assert (
+            estimate.blending + estimate.pupils + estimate.sampling > rms / float(expected.square().mean().sqrt()) / 3
+        )
+        if spacing is None:
+            assert 20 * math.log10(float(expected.max()) / rms) > 60
+    assert "places" in str(estimate)
+    assert estimate.total > 0
+
+
+def test_the_adjoint_of_the_linear_part() -> None:
+    imaging = optics.Imaging(small(), pixel_pitch=50 * um, psf_shape=(9, 9), spacing=16)
+    x = (noise(1, 2, 20, 27) + 0.1).requires_grad_()
+    picture = imaging(scene_of(x))
+    y = noise(*picture.shape, seed=3)
+    (back,) = torch.autograd.grad((picture * y).sum(), x)
+    assert float((picture.detach() * y).sum()) == pytest.approx(float((x.detach() * back).sum()), rel=1e-5)
+
+
+@pytest.mark.parametrize("depth", ["map", "batch"])
+def test_distances_over_the_field(depth: str) -> None:
+    """Of a map each half, away from the edge between them, is as if all were there; of a batch each item alone."""
+    imaging = optics.Imaging(small(), pixel_pitch=8 * um, psf_shape=(11, 11), spacing=12)
+    light = noise(2, 1, 24, 40)
+    near, far = (imaging(scene_of(light, distance)) for distance in (0.15, 2.0))
+    assert float((near - far).abs().max()) > 0.02
+    if depth == "batch":
+        found = imaging(scene_of(light, torch.tensor([0.15, 2.0], dtype=DOUBLE)))
+        assert float((found - torch.stack([near[0], far[1]])).abs().max()) < 1e-6
+        return
+    places = torch.full((2, 1, 24, 40), 2.0, dtype=DOUBLE)
+    places[..., :20] = 0.15
+    found = imaging(scene_of(light, places))
+    assert float((found - near)[..., :12].abs().max()) < 1e-4
+    assert float((found - far)[..., 28:].abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("what", ["radius", "thickness", "semi_diameter"])
+def test_pictures_have_gradients_to_the_surfaces(what: str) -> None:
+    lens = small()
+    surface = lens.surfaces[lens.stop if what == "semi_diameter" else 1 if what == "thickness" else 4]
+    value = float(getattr(surface, what))
+    delattr(surface, what)
+    parameter = nn.Parameter(torch.tensor(value, dtype=DOUBLE))
+    surface.register_parameter(what, parameter)
+    imaging = optics.Imaging(lens, pixel_pitch=50 * um, psf_shape=(9, 9), spacing=16)
+    light, weights = noise(1, 1, 20, 24), noise(1, 1, 20, 24, seed=5)
+
+    def loss() -> Tensor:
+        return (imaging(scene_of(light)) * weights).sum()
+
+    (gradient,) = torch.autograd.grad(loss(), parameter)
+    step = 3e-6 * abs(value)
+    with torch.no_grad():
+        ends = []
+        for sign in (1, -1):
+            parameter += sign * step
+            ends.append(float(loss()))
+            parameter -= sign * step
+    slope = (ends[0] - ends[1]) / (2 * step)
+    assert float(gradient) == pytest.approx(slope, rel=5e-3, abs=3e-4 * float(loss().detach()) / abs(value))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (17, 2), (33, 20)])
+@pytest.mark.parametrize("border", ["reflect", "zero"])
+def test_pictures_of_any_shape(shape: tuple[int, int], border: str) -> None:
+    imaging = optics.Imaging(small(), pixel_pitch=50 * um, border=border)
+    picture = imaging(scene_of(torch.ones(1, 1, *shape)), colour_filter=None)
+    assert picture.shape == (1, 1, *shape)
+    assert bool((picture > 0).all())
+    assert bool((picture < 1.01).all())
+
+
+def test_the_axis_alone_is_a_picture_of_one_psf() -> None:
+    lens, light = small(), noise(1, 1, 16, 20)
+    alone = optics.Imaging(lens, pixel_pitch=10 * um, field=False, psf_shape=(9, 9))
+    psf = lens.psf(LINES[:1], distances=1.0, pixel_pitch=10 * um, shape=(9, 9), dtype=DOUBLE)
+    measured = optics.MeasuredPSF(psf, wavelengths=LINES[:1], distances=1.0, pixel_pitch=10 * um)
+    expected = optics.Imaging(measured, pixel_pitch=10 * um)(scene_of(light))
+    assert float((alone(scene_of(light)) - expected).abs().max()) < 2e-3
+    assert float((optics.Imaging(lens, pixel_pitch=10 * um)(scene_of(light)) - expected).abs().max()) > 5e-3
+
+
+def test_a_camera_with_a_real_lens_comes_back_from_its_file(tmp_path: Path) -> None:
+    imaging = optics.Imaging(small(), pixel_pitch=40 * um, centre=(0.1 * mm, 0.0), spacing=16, psf_shape=(9, 9))
+    camera = Camera(imaging, sensor.ColourFilter.nikon())
+    camera.save(tmp_path / "camera.safetensors")
+    scene = Scene.builtin("coffee", (20, 30)).with_depth(1.0)
+    assert torch.equal(Camera.load(tmp_path / "camera.safetensors")(scene), camera(scene))
+
+
+def test_what_cannot_be_is_a_clear_error() -> None:
+    with pytest.raises(ValueError, match="beyond the field of this lens"):
+        optics.Imaging(small(), pixel_pitch=400 * um)(scene_of(torch.ones(1, 1, 64, 64)))
+    with pytest.raises(ValueError, match="centre must be x and y"):
+        optics.Imaging(small(), centre=(1.0, 2.0, 3.0))
+    with pytest.raises(ValueError, match="centre must be x and y"):
+        optics.Imaging(small(), centre=(5.0, 2.0))
+    thin = optics.Lens(optics.CircularAperture(3 * mm), optics.ThinLens(20 * mm), focus_distance=1.0)
+    with pytest.raises(ValueError, match="one PSF, that on the axis"):
+        optics.Imaging(thin, field=True)
+    with pytest.raises(ValueError, match="sees one PSF"):
+        optics.Imaging(thin).explain(scene_of(torch.ones(1, 1, 8, 8)))
