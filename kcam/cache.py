@@ -23,7 +23,7 @@ import types
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -166,12 +166,15 @@ def _settings_of(thing: Any, tensors: list[Tensor]) -> Any:
     return value
 
 
+T = TypeVar("T")
+
+
 class ValueCache:
-    """One tensor and the values that it was computed from."""
+    """One result, a tensor or a dataclass of kcam that holds some, and the values that it was computed from."""
 
-    _kept: tuple[Any, tuple[Tensor, ...], Tensor] | None = None  # set and read at once: other threads use it too
+    _kept: tuple[Any, tuple[Tensor, ...], Any] | None = None  # set and read at once: other threads use it too
 
-    def get(self, key: Any, build: Callable[[], Tensor]) -> Tensor:
+    def get(self, key: Any, build: Callable[[], T]) -> T:
         """The kept result if `key`, of whatever it depends on, has the value of the kept one, else a new one.
 
         It must not be changed in place. Inference mode has a result of its own, which autograd refuses outside.
@@ -188,16 +191,26 @@ class ValueCache:
             return build()
         kept = self._kept
         if kept is not None and kept[0] == key and all(map(_same_bits, kept[1], tensors)):
-            return kept[2]
+            return kept[2]  # type: ignore[no-any-return]
         before = tuple(tensor.detach().clone() for tensor in tensors)
         value = build()
-        if type(value) is Tensor and not differentiated(value):
+        if not _has_derivative(value):
             self._kept = key, before, value
         return value
 
     def __reduce__(self) -> tuple[type[ValueCache], tuple[()]]:
         """A copy has kept nothing."""
         return ValueCache, ()
+
+
+def _has_derivative(value: Any) -> bool:
+    """Whether a derivative passes through a result, or might."""
+    tensors: list[Tensor] = []
+    try:
+        value_of(value, tensors)
+    except Unknown:
+        return True
+    return any(map(differentiated, tensors))
 
 
 def _recorded(tensor: Tensor) -> bool:

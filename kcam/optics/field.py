@@ -72,7 +72,7 @@ class FieldPicture:
 
     psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. render: of one
     zone. border: see `Imaging`. spacing: pixels between nodes, or None. whole:
-    the light outside the window is put back into it.
+    the light outside the window is put back into it. mixing: weights (M, L) of what the picture adds up.
     """
 
     psfs: FieldPSFs
@@ -82,6 +82,7 @@ class FieldPicture:
     border: str
     spacing: int | None = None
     whole: bool = True
+    mixing: Tensor | None = None
 
     def light(self, planes: Tensor, shares: Tensor | None) -> Tensor:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
@@ -118,7 +119,7 @@ class FieldPicture:
     def bank(self, places: Tensor) -> Tensor:
         """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
         on_sensor = self._on_sensor(places)
-        psfs = self.psfs.bank(on_sensor, self.pixels, whole=self.whole)
+        psfs = self.psfs.bank(on_sensor, self.pixels, whole=self.whole, mixing=self.mixing)
         return psfs / self.psfs.illumination(on_sensor).to(psfs).view(-1, 1, 1, 1, 1)
 
     def explain(self, planes: Tensor, shares: Tensor | None) -> FieldEstimate:
@@ -134,7 +135,7 @@ class FieldPicture:
             rows, columns = (
                 len(Axis.of(n, m, apart=apart).nodes) for n, m in zip(picture, self.pixels.shape, strict=True)
             )
-            return FieldEstimate((rows, columns), apart, error, **self.psfs.deviations(self.pixels))
+            return FieldEstimate((rows, columns), apart, error, **self.psfs.deviations(self.pixels, mixing=self.mixing))
 
     @property
     def _centre(self) -> Tensor:

@@ -107,7 +107,7 @@ class Imaging(Stage):
             raise TypeError(f"accuracy must be an optics.Accuracy, got {describe(accuracy)}. Use Accuracy(bands=12).")
         self.accuracy = replace(accuracy, **shortcuts)
         self._warns = True  # of too few layers
-        self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
+        self._bank_cache, self._transfer_cache, self._field_cache = ValueCache(), ValueCache(), ValueCache()
         self._check_recipe()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -428,14 +428,15 @@ class Imaging(Stage):
     def _middle(self) -> tuple[float, float]:
         return self.centre or (0.0, 0.0)
 
-    def _over_field(
-        self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
-    ) -> FieldPSFs:
+    def _over_field(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """PSFs of all places of a picture."""
         lens: Any = self.lens  # which `varies` has made sure of
         half = (self.pixel_pitch * n / 2 for n in picture[::-1])
         corner = math.hypot(*(abs(c) + side for c, side in zip(self._middle, half, strict=True)))
-        return lens.over_field(corner, vergences, self._psf_wavelengths(wavelengths), mixing=mixing)
+        grouped = self._psf_wavelengths(wavelengths)
+        return self._field_cache.get(
+            (self.lens, corner, vergences, grouped), lambda: lens.over_field(corner, vergences, grouped)
+        )
 
     def _field_picture(
         self, scene: Scene, *, vergences: Tensor, window: tuple[int, int], weights: Tensor | None, like: Tensor
@@ -447,7 +448,7 @@ class Imaging(Stage):
         if weights is not None:
             shape = Renderer(like.new_empty(1, len(self._psf_wavelengths(scene.wavelengths)), 1, 1), **rendering)
             mixing = shape.mixing().detach().flatten(0, 1)
-        psfs = self._over_field(picture, vergences, scene.wavelengths, mixing=mixing)
+        psfs = self._over_field(picture, vergences, scene.wavelengths)
 
         def render(bank: Tensor, planes: Tensor, shares: Tensor | None, *, occlusion: bool | None = None) -> Tensor:
             own = rendering | {"picture": (planes.shape[-2], planes.shape[-1])}
@@ -457,7 +458,7 @@ class Imaging(Stage):
 
         pixels, spacing = self.pixels(window, like), self.accuracy.spacing
         whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
-        return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole)
+        return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole, mixing)
 
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
         """What a picture over the field will be off by; as it is with `forward`'s arguments. Raises: ValueError for

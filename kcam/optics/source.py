@@ -127,9 +127,12 @@ class PSFSource(Photometric, Protocol):
 class FieldPSFs(Protocol):
     """PSFs over the sensor, of points at some vergences (Z,) and wavelengths (L,)."""
 
-    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False) -> Tensor:
+    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False, mixing: Tensor | None = None) -> Tensor:
         """PSFs (F, Z, L, h, w) of what the chief ray of the focus brings to places (F, 2) [m], as light falls; relative
-        to the light of a point on the axis. The window's middle is that place. whole: light outside is put back.
+        to the light of a point on the axis. The window's middle is that place.
+
+        whole: light outside is put back. mixing: weights (M, L) of what the picture adds up, from which follows how
+        closely wavelengths are to be told apart; None: each is seen.
         """
 
     def window(self, pixels: PixelGrid) -> tuple[int, int]:
@@ -141,7 +144,7 @@ class FieldPSFs(Protocol):
     def illumination(self, places: Tensor) -> Tensor:
         """About the irradiance of an even scene at places (..., 2) [m], over that on the axis: a smooth curve > 0."""
 
-    def deviations(self, pixels: PixelGrid) -> dict[str, float]:
+    def deviations(self, pixels: PixelGrid, *, mixing: Tensor | None = None) -> dict[str, float]:
         """What PSFs may be off by, of their light: pupils, colours, sampling, outside; see `field.FieldEstimate`."""
 
 
@@ -149,10 +152,5 @@ class FieldPSFs(Protocol):
 class FieldSource(PSFSource, Protocol):
     """Optics whose PSF varies over the sensor, computed for any place."""
 
-    def over_field(
-        self, reach: float, vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
-    ) -> FieldPSFs:
-        """For places up to `reach` from the axis [m], points at vergences (Z,) [1/m], wavelengths (L,) [m].
-
-        mixing: weights (M, L) of what the picture adds up, from which follows how closely wavelengths are told apart.
-        """
+    def over_field(self, reach: float, vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
+        """For places up to `reach` from the axis [m], points at vergences (Z,) [1/m], wavelengths (L,) [m]."""

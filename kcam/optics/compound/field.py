@@ -20,6 +20,7 @@ COLOUR_ERROR = 1e-2
 OUTSIDE = 5e-3
 """Share of the light that the default window may leave out; it is put back into the window, see `Imaging`."""
 _HALVINGS = 30
+KEPT = 2e8  # bytes of PSFs that are kept
 
 
 def bank(
@@ -56,10 +57,10 @@ class FieldPSFs:
     vergences: Tensor
     wavelengths: Tensor
     reach: float  # of places, from the axis [m]
-    mixing: Tensor | None = None  # (M, L): what a picture adds up of the wavelengths' PSFs; None: each is seen
 
-    kept: dict[PixelGrid, tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
+    kept: dict[tuple[object, ...], tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
     kept_curves: dict[str, Even] = field(default_factory=dict, repr=False)
+    kept_banks: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
@@ -67,17 +68,27 @@ class FieldPSFs:
         grid = torch.meshgrid(heights, self.vergences, wavelengths, indexing="ij")
         return self.table.at(*(part.flatten() for part in grid))
 
-    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False) -> Tensor:
+    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False, mixing: Tensor | None = None) -> Tensor:
         """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
-        of a point on the axis. whole: what leaves the window is put back into it.
+        of a point on the axis. whole, mixing: see `source.FieldPSFs`.
 
         Places that mirror each other share their PSF; of many wavelengths the PSFs' pixels are polynomials through
-        those of a few (`colours`).
+        those of a few (`colours`). Without gradients they are kept for another picture, up to `KEPT` bytes.
         """
+        key = (pixels, whole, _bytes(mixing), _bytes(places))
+        if key in self.kept_banks:
+            return self.kept_banks[key]
+        found = self._mirrored(places, pixels, whole=whole, mixing=mixing)
+        held = sum(bank.nbytes for bank in self.kept_banks.values())
+        if not found.requires_grad and held + found.nbytes <= KEPT:
+            self.kept_banks[key] = found
+        return found
+
+    def _mirrored(self, places: Tensor, pixels: PixelGrid, *, whole: bool, mixing: Tensor | None) -> Tensor:
         height, width = pixels.shape
         odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
         own, which = (places.abs() / (1e-6 * pixels.pitch)).round().unique(dim=0, return_inverse=True)
-        nodes, shares, _ = self.colours(pixels)
+        nodes, shares, _ = self.colours(pixels, mixing)
         psfs = self._bank(own * (1e-6 * pixels.pitch), nodes, odd, whole=whole)
         if len(nodes) < len(self.wavelengths):
             psfs = torch.einsum("ln,fznhw->fzlhw", shares.to(psfs), psfs)
@@ -97,21 +108,22 @@ class FieldPSFs:
         moved = chief + radii[:, None, None]
         return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
 
-    def colours(self, pixels: PixelGrid) -> tuple[Tensor, Tensor, float]:
+    def colours(self, pixels: PixelGrid, mixing: Tensor | None = None) -> tuple[Tensor, Tensor, float]:
         """Wavelengths (n,) at which PSFs are computed, and what each gives to those that are asked for, (L, n): as few
         as leave `COLOUR_ERROR` of the light in what the picture adds up of them; and what these leave.
         """
-        if pixels not in self.kept:
-            self.kept[pixels] = self._few(pixels)
-        return self.kept[pixels]
+        key = (pixels, _bytes(mixing))
+        if key not in self.kept:
+            self.kept[key] = self._few(pixels, mixing)
+        return self.kept[key]
 
     @torch.no_grad()
-    def _few(self, pixels: PixelGrid) -> tuple[Tensor, Tensor, float]:
+    def _few(self, pixels: PixelGrid, mixing: Tensor | None) -> tuple[Tensor, Tensor, float]:
         every = torch.eye(len(self.wavelengths), dtype=torch.float64)
         if len(self.wavelengths) <= _COLOURS[0]:
             return self.wavelengths, every, 0.0
         places = torch.tensor([[0.0, 0.0], [0.42, 0.56]], dtype=torch.float64) * self.reach
-        mixing = every if self.mixing is None else self.mixing.double()
+        mixing = every if mixing is None else mixing.double()
         mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
         truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), self._bank(places, self.wavelengths, pixels))
         low, high = self.wavelengths.aminmax()
@@ -128,10 +140,10 @@ class FieldPSFs:
         return self.wavelengths, every, 0.0
 
     @torch.no_grad()
-    def deviations(self, pixels: PixelGrid) -> dict[str, float]:
+    def deviations(self, pixels: PixelGrid, *, mixing: Tensor | None = None) -> dict[str, float]:
         """What PSFs may be off by, of their light: see `field.FieldEstimate`."""
         places = torch.tensor([[0.0, 0.0], [0.54, 0.72]], dtype=torch.float64) * self.reach
-        psfs = self.bank(places, pixels)
+        psfs = self.bank(places, pixels, mixing=mixing)
         radii = places.norm(dim=1)
         fitted = self._fitted(radii, self.wavelengths)
         frame = Frame.upright(fitted)
@@ -142,7 +154,7 @@ class FieldPSFs:
         )
         return {
             "pupils": pupils,
-            "colours": self.colours(pixels)[2],
+            "colours": self.colours(pixels, mixing)[2],
             "sampling": QUICK_ERROR,
             "outside": float(lost.max().clamp(min=0)),
         }
@@ -197,3 +209,7 @@ class FieldPSFs:
         frame = Frame.upright(fitted)
         own = torch.cat([radii, radii.new_zeros(1)]).repeat_interleave(len(self.vergences) * len(self.wavelengths))
         return frame.slopes + (fitted.chief + own).abs()[:, None], areas(fitted, frame)
+
+
+def _bytes(values: Tensor | None) -> bytes | None:
+    return None if values is None else values.detach().cpu().numpy().tobytes()

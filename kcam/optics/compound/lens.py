@@ -459,11 +459,9 @@ class CompoundLens(nn.Module):
         over_radius = Even.through(heights / radii, radii, reach=float(radii.detach().max()))
         return ImageHeights(over_radius, scale)
 
-    def over_field(
-        self, reach: float, vergences: Tensor, wavelengths: Tensor, *, mixing: Tensor | None = None
-    ) -> FieldPSFs:
+    def over_field(self, reach: float, vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """PSFs of all places up to `reach` from the axis [m], for points at vergences (Z,) [1/m] and wavelengths (L,)
-        [m]; mixing: see `source.FieldSource`.
+        [m].
         """
         self.check()
         heights = self.image_heights(max(reach, 1e-9))
@@ -475,7 +473,7 @@ class CompoundLens(nn.Module):
             vergences=vergences.to(torch.float64),
             wavelengths=wavelengths.to(torch.float64),
         )
-        return FieldPSFs(table, heights, vergences.to(torch.float64), wavelengths.to(torch.float64), reach, mixing)
+        return FieldPSFs(table, heights, vergences.to(torch.float64), wavelengths.to(torch.float64), reach)
 
     def _asked(self, wavelengths: Tensor | list[float], distances: Tensor | float, field: Tensor | None) -> _Asked:
         self.check()
