@@ -262,23 +262,30 @@ class Camera(nn.Module):
             optics.ThinLens(focal_length=4.3 * mm),
             focus_distance=2.0,
         )
-        return Camera(
-            optics.Imaging(lens, pixel_pitch=1.4 * um),
-            sensor.ColourFilter.nikon(),
-            sensor.Mosaic("RGGB"),
-            sensor.Exposure(),
-            sensor.ShotNoise(full_well=6_000),
-            sensor.ReadNoise(2.0),
-            sensor.ADC(bits=10, black_level=64),
-            isp.Demosaic(),
-            isp.WhiteBalance(),
-            isp.ColourMatrix(),
-            isp.ToneCurve(),
-        )
+        return Camera(optics.Imaging(lens, pixel_pitch=1.4 * um), *_rgb_sensor(full_well=6_000, read_noise=2.0))
+
+    @staticmethod
+    def phone_lens() -> Camera:
+        """A phone's camera with a real lens, over its whole field: three aspheres of 3.74 mm f/2.8 (`CompoundLens`
+        "phone") in focus at 2 m, 0.9 um pixels; the lens reaches as far as 4000 x 3000 of them.
+        """
+        lens = optics.CompoundLens.preset("phone", focus_distance=2.0)
+        return Camera(optics.Imaging(lens, pixel_pitch=0.9 * um), *_rgb_sensor(full_well=4_500, read_noise=1.5))
+
+    @staticmethod
+    def slr() -> Camera:
+        """A full-frame camera of 4368 x 2912 pixels of 8.2 um behind a real 50 mm at f/4 (`CompoundLens` "ef50"), in
+        focus at 5 m, 12 bits.
+        """
+        lens = optics.CompoundLens.preset("ef50", focus_distance=5.0)
+        stop = lens.surfaces[lens.stop]
+        stop.semi_diameter = float(stop.semi_diameter) * lens.f_number / 4  # type: ignore[arg-type]
+        sensor_ = _rgb_sensor(full_well=60_000, read_noise=4.0, bits=12, black_level=128)
+        return Camera(optics.Imaging(lens, pixel_pitch=8.2 * um), *sensor_)
 
     @classmethod
     def preset(cls, name: str) -> Camera:
-        """A camera by the name of its preset: "thesis", "ideal" or "phone"; see the methods of these names."""
+        """A camera by the name of its preset, see the methods: "thesis", "ideal", "phone", "phone_lens" or "slr"."""
         if name not in PRESETS:
             raise ValueError(f"unknown preset {name!r}. There are: {', '.join(PRESETS)}.")
         return PRESETS[name]()
@@ -299,7 +306,25 @@ PRESETS: dict[str, Callable[[], Camera]] = {
     "thesis": Camera.thesis,
     "ideal": Camera.ideal,
     "phone": Camera.phone,
+    "phone_lens": Camera.phone_lens,
+    "slr": Camera.slr,
 }
+
+
+def _rgb_sensor(*, full_well: float, read_noise: float, bits: int = 10, black_level: int = 64) -> list[nn.Module]:
+    """All behind the lens, from the colour filter to sRGB."""
+    return [
+        sensor.ColourFilter.nikon(),
+        sensor.Mosaic("RGGB"),
+        sensor.Exposure(),
+        sensor.ShotNoise(full_well=full_well),
+        sensor.ReadNoise(read_noise),
+        sensor.ADC(bits=bits, black_level=black_level),
+        isp.Demosaic(),
+        isp.WhiteBalance(),
+        isp.ColourMatrix(),
+        isp.ToneCurve(),
+    ]
 
 
 def _check_order(stages: Sequence[nn.Module]) -> None:

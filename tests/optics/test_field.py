@@ -52,8 +52,8 @@ def test_an_even_scene_stays_even_under_distortion(border: str) -> None:
 
 
 def test_distortion_moves_light_where_it_belongs() -> None:
-    """The centre of a pixel's light, for barrel and cushion: to half a pixel times what columns are inclined by, 0.05
-    here; and what the scene's pixel covers is its light.
+    """The centre of a pixel's light, for barrel and cushion: to half of what pixels are stretched by, 0.1 here, for
+    light is even over each; and what the scene's pixel covers is its light.
     """
     for strength in (4e-5, -4e-5):
 
@@ -68,7 +68,7 @@ def test_distortion_moves_light_where_it_belongs() -> None:
             point[..., row, column] = 1
             light = moves(point)[0, 0]
             where = torch.stack([(light * x).sum(), (light * y[:, None]).sum()]) / light.sum()
-            assert float((ideal(where) - torch.tensor([x[column], y[row]])).norm()) < 0.03
+            assert float((ideal(where) - torch.tensor([x[column], y[row]])).norm()) < 0.05
             middle = torch.tensor([x[column], y[row]], dtype=DOUBLE)
             jacobian = torch.autograd.functional.jacobian(ideal, where)
             assert float(light.sum() * jacobian.det()) == pytest.approx(1, rel=1e-2)
@@ -256,6 +256,19 @@ def test_a_camera_with_a_real_lens_comes_back_from_its_file(tmp_path: Path) -> N
     camera.save(tmp_path / "camera.safetensors")
     scene = Scene.builtin("coffee", (20, 30)).with_depth(1.0)
     assert torch.equal(Camera.load(tmp_path / "camera.safetensors")(scene), camera(scene))
+
+
+@pytest.mark.parametrize("name", ["slr", pytest.param("phone_lens", marks=pytest.mark.slow)])
+def test_presets_with_real_lenses_take_pictures(name: str) -> None:
+    """The middle of the picture is what the lens' own PSF on the axis makes of it; the second picture is the first."""
+    camera = Camera.preset(name)
+    scene = Scene.builtin("coffee", (20, 30)).with_depth(2.0 if name == "phone_lens" else 5.0)
+    seeds = [torch.Generator().manual_seed(1) for _ in range(2)]
+    first, second = (camera(scene, generator=seed) for seed in seeds)
+    assert torch.equal(first, second)
+    axis = Camera(camera[0].changed(field=False, psf_shape=(33, 33)), camera[1])(scene)
+    varied = Camera(camera[0].changed(psf_shape=(33, 33)), camera[1])(scene)
+    assert float((axis - varied).abs().max() / axis.max()) < 0.02
 
 
 def test_what_cannot_be_is_a_clear_error() -> None:

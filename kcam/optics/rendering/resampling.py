@@ -3,7 +3,7 @@
 A pixel of the picture shows the mean of the scene over the part that it sees: an even scene stays even, nothing
 aliases, and no light is moved by more than it was moved by the lens. Two passes, along rows and then along columns
 (Catmull and Smith, SIGGRAPH 1980): each is a mean over stretches of pixels, exact for scene pixels that are squares of
-even light.
+even light. A pixel's light is even over it: where pixels are stretched by 10 %, a point may lie 0.05 pixels off.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from kcam.optics.rendering.borders import border_index
 Ideal = Callable[[Tensor], Tensor]
 """Where without distortion the light would fall that falls at places (..., 2) [pixels]."""
 
-_STEP = 4  # pixels between places that are computed; between them it is linear: 3e-4 pixels for 5 % in a frame of 4000
+_STEP, _LONG = 4, 512  # pixels between computed places, on longer sides; linear between: 2e-3 pixels for 5 %
 _UNMOVED = 1e-3  # pixels: less is not moved
 _FIXED_POINT = 12  # steps to where a row of the scene crosses a column of the picture
 _AT_ONCE = 2**22  # pixels of a plane
@@ -68,7 +68,7 @@ def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resamplin
 
 def _coarse(n: int) -> Tensor:
     """Places from edge to edge of n pixels about their middle, at most some pixels apart."""
-    return torch.linspace(-n / 2, n / 2, 2 + math.ceil(n / _STEP), dtype=torch.float64)
+    return torch.linspace(-n / 2, n / 2, 2 + math.ceil(n / (_STEP if n > _LONG else 1)), dtype=torch.float64)
 
 
 def _edges(n: int) -> Tensor:
