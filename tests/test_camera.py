@@ -57,6 +57,10 @@ class Gain(Stage):
         return signal * self.weight
 
 
+REAL = ("phone_lens", "slr")  # seconds to trace and fit
+SOME = [pytest.param(name, marks=pytest.mark.slow) if name in REAL else name for name in PRESETS]
+
+
 def rgb_scene(height: int = 24, width: int = 32, **arguments: Any) -> Scene:
     g = torch.Generator().manual_seed(1)
     return Scene.from_rgb(torch.rand(3, height, width, generator=g), **arguments)
@@ -247,7 +251,7 @@ def test_copies_are_independent() -> None:
     assert other[0].lens is not camera[0].lens
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", SOME)
 def test_presets_are_deterministic(name: str) -> None:
     state = torch.random.get_rng_state()
     one, two = Camera.preset(name), Camera.preset(name)
@@ -257,7 +261,7 @@ def test_presets_are_deterministic(name: str) -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", SOME)
 def test_presets_take_pictures(name: str) -> None:
     picture = Camera.preset(name)(rgb_scene(30, 41, wavelengths=FEW), generator=seeded()).detach()
     assert picture.shape == (1, 3, 30, 41)
@@ -278,7 +282,7 @@ def test_the_ideal_camera_sees_the_scene() -> None:
     assert float((picture - image).abs().mean()) < 0.03
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", SOME)
 def test_save_and_load(name: str, tmp_path: Path) -> None:
     camera, path = Camera.preset(name), tmp_path / "camera.safetensors"
     with torch.no_grad():

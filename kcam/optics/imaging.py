@@ -127,12 +127,14 @@ class Imaging(Stage):
         return {name: getattr(self, name) for name in names} | self.accuracy.settings()
 
     def changed(self, **arguments: Any) -> Imaging:
-        """The same stage with some of its constructor's arguments changed; it shares the lens and has kept nothing.
+        """The same stage with some of its constructor's arguments changed; it shares the lens and what is known of its
+        field, by value, and has kept nothing else.
 
         Of layers that are changed here no warning says that they are few: a plan has weighed what they cost.
         """
         changed = Imaging(**(self.configuration() | arguments))
         changed._warns = self._warns and "layers" not in arguments
+        changed._field_cache = self._field_cache
         return changed
 
     def _check_recipe(self) -> None:

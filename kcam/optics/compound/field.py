@@ -78,7 +78,7 @@ class FieldPSFs:
         key = (pixels, whole, _bytes(mixing), _bytes(places))
         if key in self.kept_banks:
             return self.kept_banks[key]
-        found = self._mirrored(places, pixels, whole=whole, mixing=mixing)
+        found = self._mirrored(places, pixels, whole=whole, mixing=mixing).to(pixels.device)
         held = sum(bank.nbytes for bank in self.kept_banks.values())
         if not found.requires_grad and held + found.nbytes <= KEPT:
             self.kept_banks[key] = found
@@ -123,7 +123,7 @@ class FieldPSFs:
         if len(self.wavelengths) <= _COLOURS[0]:
             return self.wavelengths, every, 0.0
         places = torch.tensor([[0.0, 0.0], [0.42, 0.56]], dtype=torch.float64) * self.reach
-        mixing = every if mixing is None else mixing.double()
+        mixing = every if mixing is None else mixing.double().cpu()
         mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
         truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), self._bank(places, self.wavelengths, pixels))
         low, high = self.wavelengths.aminmax()

@@ -91,7 +91,7 @@ def _fine(values: Tensor, x: Tensor, y: Tensor, *, columns: Tensor, rows: Tensor
 
 def _means(planes: Tensor, edges: Tensor, border: str) -> Tensor:
     """Mean along each row (B, K, R, W) between neighbouring edges (R, W + 1) [pixels; pixel i is i -+ 1/2]."""
-    rows = max(1, _AT_ONCE // max(1, planes.shape[-1]))
+    rows, edges = max(1, _AT_ONCE // max(1, planes.shape[-1])), edges.to(planes.device)
     parts = zip(planes.split(rows, dim=-2), edges.split(rows), strict=True)
     return torch.cat([_means_of(part, own, border) for part, own in parts], dim=-2)
 
