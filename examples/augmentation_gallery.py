@@ -80,6 +80,13 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
         "barrel to pincushion, k1 =",
         {f"{k:g}": lambda k=k: KC.RandomLensDistortion(k1=k, p=1.0) for k in (-0.2, -0.1, 0.3)},
     ),
+    "RandomLens": (
+        "real lenses, the picture to 95 % of their field",
+        {
+            name.replace("_", " "): lambda name=name: KC.RandomLens(name, 0.95, distance=2.0, stops=0.0, p=1.0)
+            for name in ("cooke_triplet", "phone", "double_gauss")
+        },
+    ),
     "RandomBayer": (
         "mosaic and demosaic",
         {

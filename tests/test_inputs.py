@@ -220,6 +220,7 @@ AUGMENTATIONS: dict[str, Door] = {
         "RandomColourMatrix": KC.RandomColourMatrix(p=1.0),
         "RandomToneCurve": KC.RandomToneCurve(p=1.0),
         "RandomCamera": KC.RandomCamera([Camera.ideal()], tolerance=0),
+        "RandomLens": KC.RandomLens("phone", p=1.0, steps=1),
     }.items()
 }
 AUGMENTATIONS |= {

@@ -5,6 +5,7 @@ from kcam.augmentation.camera import RandomCamera
 from kcam.augmentation.corruptions import CORRUPTIONS, Corruption, corrupt
 from kcam.augmentation.geometry import RandomLensDistortion
 from kcam.augmentation.isp import RandomColourMatrix, RandomToneCurve, RandomWhiteBalance
+from kcam.augmentation.lens import RandomLens
 from kcam.augmentation.optics import (
     RandomAberration,
     RandomChromaticAberration,
@@ -36,6 +37,7 @@ __all__ = [
     "RandomDiffraction",
     "RandomExposure",
     "RandomFixedPattern",
+    "RandomLens",
     "RandomLensDistortion",
     "RandomQuantisation",
     "RandomShotReadNoise",

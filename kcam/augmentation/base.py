@@ -248,9 +248,17 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
         return drawn
 
     def _simulated(self, input: Tensor, drawn: dict[str, Tensor], *, linear: bool) -> Tensor:
-        working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-        check_values(working, picture=is_picture(working) and not linear)
-        with full_precision(input.device):
-            coded = self.in_light and is_picture(working) and not linear
-            result = self.simulate(to_light(working) if coded else working, drawn)
-            return (tone_curve(result) if coded else result).to(input.dtype)
+        return simulated(input, lambda light: self.simulate(light, drawn), linear=linear, in_light=self.in_light)
+
+
+def simulated(input: Tensor, effect: Callable[[Tensor], Tensor], *, linear: bool, in_light: bool = True) -> Tensor:
+    """An effect on (B,C,H,W), checked, in float32 at least and outside of autocast; of the type of the input.
+
+    linear: whether a picture is linear light already. in_light: whether the effect wants that.
+    """
+    working = input if input.dtype in (torch.float32, torch.float64) else input.float()
+    check_values(working, picture=is_picture(working) and not linear)
+    with full_precision(input.device):
+        coded = in_light and is_picture(working) and not linear
+        result = effect(to_light(working) if coded else working)
+        return (tone_curve(result) if coded else result).to(input.dtype)

@@ -12,6 +12,7 @@ import torch
 from kcam.augmentation.base import TAKES, check_layout
 from kcam.augmentation.geometry import RandomLensDistortion
 from kcam.augmentation.isp import RandomWhiteBalance
+from kcam.augmentation.lens import RandomLens
 from kcam.augmentation.optics import (
     RandomAberration,
     RandomChromaticAberration,
@@ -56,6 +57,7 @@ CORRUPTIONS: dict[str, Corruption] = {
     "vignetting": _growing(RandomVignetting, "field", (50.0, 65.0, 80.0, 95.0, 110.0), shade=0.2),
     "barrel_distortion": _growing(RandomLensDistortion, "k1", (-0.05, -0.1, -0.15, -0.2, -0.25)),
     "pincushion_distortion": _growing(RandomLensDistortion, "k1", (0.05, 0.1, 0.2, 0.3, 0.4)),
+    "real_lens": _growing(RandomLens, "reach", (0.3, 0.45, 0.6, 0.75, 0.95), lens="phone", distance=0.5, stops=0.0),
     "mosaic": Corruption(  # by the loss that isp.demosaic's table shows
         RandomBayer,
         (

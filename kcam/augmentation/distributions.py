@@ -23,6 +23,7 @@ class Uniform:
     scale: what it is uniform in: itself, its logarithm (f-numbers, ISO), or its inverse (distances: an equal step in
         1/m is an equal step of blur).
     least, most: which bounds are allowed, both included. unit: for the error.
+    steps: one of so many numbers, equally far apart on that scale and both bounds among them; 0 for any number.
     """
 
     bounds: Bounds
@@ -30,6 +31,7 @@ class Uniform:
     least: float = -math.inf
     most: float = math.inf
     unit: str = ""
+    steps: int = 0
 
     def tensor(self, name: str) -> Tensor:
         """The bounds, (2,); ValueError or TypeError for what can be none."""
@@ -62,6 +64,9 @@ class Uniform:
     def between(self, bounds: Tensor, share: Tensor) -> Tensor:
         """The number a share of the way from the lower bound to the upper one."""
         low, high = bounds
+        if self.steps:
+            index = (share * self.steps).floor().clamp(max=self.steps - 1)
+            share = index / (self.steps - 1) if self.steps > 1 else torch.full_like(share, 0.5)
         if self.scale == "log":
             return low * (high / low) ** share
         if self.scale == "vergence":

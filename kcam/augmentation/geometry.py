@@ -23,84 +23,23 @@ _TOLERANCE = 0.01  # of the inverse, at probes all over the picture [pixels]
 _EDGE_SAMPLES = 9  # of a box's edge: a straight edge becomes a curve
 
 
-class RandomLensDistortion(Checked, K.GeometricAugmentationBase2D):
-    """Barrel and pincushion distortion: the Brown-Conrady model, with OpenCV's coefficients.
+class MovedPixels(Checked, K.GeometricAugmentationBase2D):
+    """Base of the augmentations whose lens moves pixels. A subclass says where to in `_moved` and `_remapped`.
 
-    x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),   y_d = y (1 + ...) + p1 (r^2 + 2 y^2) + 2 p2 x y
-
-    with (x, y) the position from the picture's centre in units of `focal_length` times its longer side. What an ideal
-    lens images at (x, y) this one images at (x_d, y_d). Masks are taken from the nearest pixel; keypoints move exactly;
-    a box becomes the box around its moved edges. Beyond the picture it is black, and masks are 0.
-
-    Args:      k1: below 0 barrel, above 0 pincushion. k2: its next term. p1, p2: decentring.
-               focal_length: of the lens in units of the picture's longer side; 1 is a field of 53 degrees.
-               resample: of the picture, "bilinear" or "nearest".
-    Raises:    ValueError at the call where the drawn coefficients fold the picture over itself, or nearly so (the
-        inverse does not converge to 0.01 pixels).
-    Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
+    Keypoints move exactly; a box becomes the box around its moved edges.
     """
 
-    takes_alpha = True
+    def _moved(self, points: Tensor, params: dict[str, Tensor], *, inverse: bool) -> Tensor:
+        """Points (B, ..., 2) in pixels to where the lens images them, or from there."""
+        raise NotImplementedError(f"{type(self).__name__} does not say where points go.")
 
-    def __init__(
-        self,
-        k1: Bounds = (-0.2, 0.2),
-        k2: Bounds = 0.0,
-        p1: Bounds = 0.0,
-        p2: Bounds = 0.0,
-        *,
-        focal_length: float = 1.0,
-        resample: str = "bilinear",
-        same_on_batch: bool = False,
-        p: float = 0.5,
-        keepdim: bool = False,
-    ) -> None:
-        check_probability(p)
-        if resample not in ("bilinear", "nearest"):
-            raise ValueError(f'resample must be "bilinear" or "nearest", got {resample!r}.')
-        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
-        if not focal_length > 0:
-            raise ValueError(f"focal_length must be > 0 of the picture's longer side, got {focal_length:g}.")
-        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
-        draws = {name: Uniform(bounds, least=-10.0, most=10.0) for name, bounds in values.items()}
-        self._param_generator: Draws = Draws(draws)
-        self.flags = {"resample": Resample.get(resample), "align_corners": True, "focal_length": focal_length}
-        self.focal_length = focal_length
-
-    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """What is drawn, refused where it folds the picture."""
-        drawn = super().generate_parameters(batch_shape)
-        height, width = batch_shape[-2:]
-        if batch_shape[0] and not torch.compiler.is_compiling():
-            with torch.no_grad():
-                camera, coefficients = self._lens(drawn, (height, width), torch.device("cpu"))
-                probes = _probes((height, width)).expand(len(coefficients), -1, -1)
-                ideal = undistort_points(probes, camera, coefficients, num_iters=_ITERATIONS)
-                missed = (distort_points(ideal, camera, coefficients) - probes).abs().amax((1, 2))
-            bad = ~(missed < _TOLERANCE)
-            if bad.any():
-                k1, k2, p1, p2 = coefficients[bad][0].tolist()
-                raise ValueError(
-                    f"k1 = {k1:.3g}, k2 = {k2:.3g}, p1 = {p1:.3g}, p2 = {p2:.3g} fold the picture over itself, or "
-                    f"nearly so: some pixels have no one point that is imaged there. Use coefficients of half the "
-                    f"size, or focal_length={1.5 * self.focal_length:.3g}."
-                )
-        return drawn
+    def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:
+        """Each pixel of (B,C,H,W) from where the ideal lens has it, or from where this one images it."""
+        raise NotImplementedError(f"{type(self).__name__} does not say where pixels go.")
 
     def compute_transformation(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any]) -> Tensor:
         """No matrix can say what happens; Kornia's is the identity."""
         return eye_like(3, input)
-
-    def apply_transform(
-        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
-    ) -> Tensor:
-        """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
-        rows = drawn_rows(params, p=self.p)
-        if rows is None:
-            return self._remapped(input, params, flags, inverse=False)
-        drawn = {name: value[rows] if name in self._param_generator.draws else value for name, value in params.items()}
-        here = rows.to(input.device)
-        return input.index_copy(0, here, self._remapped(input[here], drawn, flags, inverse=False))
 
     def inverse_inputs(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None, **kwargs
@@ -167,6 +106,82 @@ class RandomLensDistortion(Checked, K.GeometricAugmentationBase2D):
             [torch.stack(point, -1) for point in ((left, top), (right, top), (right, bottom), (left, bottom))], dim=-2
         )
         return output
+
+
+class RandomLensDistortion(MovedPixels):
+    """Barrel and pincushion distortion: the Brown-Conrady model, with OpenCV's coefficients.
+
+    x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),   y_d = y (1 + ...) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+    with (x, y) the position from the picture's centre in units of `focal_length` times its longer side. What an ideal
+    lens images at (x, y) this one images at (x_d, y_d). Masks are taken from the nearest pixel; keypoints move exactly;
+    a box becomes the box around its moved edges. Beyond the picture it is black, and masks are 0.
+
+    Args:      k1: below 0 barrel, above 0 pincushion. k2: its next term. p1, p2: decentring.
+               focal_length: of the lens in units of the picture's longer side; 1 is a field of 53 degrees.
+               resample: of the picture, "bilinear" or "nearest".
+    Raises:    ValueError at the call where the drawn coefficients fold the picture over itself, or nearly so (the
+        inverse does not converge to 0.01 pixels).
+    Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
+    """
+
+    takes_alpha = True
+
+    def __init__(
+        self,
+        k1: Bounds = (-0.2, 0.2),
+        k2: Bounds = 0.0,
+        p1: Bounds = 0.0,
+        p2: Bounds = 0.0,
+        *,
+        focal_length: float = 1.0,
+        resample: str = "bilinear",
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        check_probability(p)
+        if resample not in ("bilinear", "nearest"):
+            raise ValueError(f'resample must be "bilinear" or "nearest", got {resample!r}.')
+        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
+        if not focal_length > 0:
+            raise ValueError(f"focal_length must be > 0 of the picture's longer side, got {focal_length:g}.")
+        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+        draws = {name: Uniform(bounds, least=-10.0, most=10.0) for name, bounds in values.items()}
+        self._param_generator: Draws = Draws(draws)
+        self.flags = {"resample": Resample.get(resample), "align_corners": True, "focal_length": focal_length}
+        self.focal_length = focal_length
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """What is drawn, refused where it folds the picture."""
+        drawn = super().generate_parameters(batch_shape)
+        height, width = batch_shape[-2:]
+        if batch_shape[0] and not torch.compiler.is_compiling():
+            with torch.no_grad():
+                camera, coefficients = self._lens(drawn, (height, width), torch.device("cpu"))
+                probes = _probes((height, width)).expand(len(coefficients), -1, -1)
+                ideal = undistort_points(probes, camera, coefficients, num_iters=_ITERATIONS)
+                missed = (distort_points(ideal, camera, coefficients) - probes).abs().amax((1, 2))
+            bad = ~(missed < _TOLERANCE)
+            if bad.any():
+                k1, k2, p1, p2 = coefficients[bad][0].tolist()
+                raise ValueError(
+                    f"k1 = {k1:.3g}, k2 = {k2:.3g}, p1 = {p1:.3g}, p2 = {p2:.3g} fold the picture over itself, or "
+                    f"nearly so: some pixels have no one point that is imaged there. Use coefficients of half the "
+                    f"size, or focal_length={1.5 * self.focal_length:.3g}."
+                )
+        return drawn
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
+        rows = drawn_rows(params, p=self.p)
+        if rows is None:
+            return self._remapped(input, params, flags, inverse=False)
+        drawn = {name: value[rows] if name in self._param_generator.draws else value for name, value in params.items()}
+        here = rows.to(input.device)
+        return input.index_copy(0, here, self._remapped(input[here], drawn, flags, inverse=False))
 
     def _lens(self, params: dict[str, Tensor], shape: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
         """Camera matrices (B,3,3) and coefficients (B,4), float64."""

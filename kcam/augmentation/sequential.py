@@ -18,6 +18,7 @@ from kornia.constants import DataKey
 from torch import Tensor, nn
 
 from kcam.augmentation.base import TAKES, CameraAugmentation, check_layout, wavelengths_of
+from kcam.augmentation.lens import RandomLens
 from kcam.augmentation.optics import finite_vergence
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context, Stage, applied
@@ -145,7 +146,8 @@ class CameraSequential(K.AugmentationSequential):
         """
         if name in self._linear:
             return {"linear": torch.ones(())}
-        ours = self.wavelengths is not None and isinstance(self.get_submodule(name), CameraAugmentation)
+        module = self.get_submodule(name)
+        ours = self.wavelengths is not None and isinstance(module, (CameraAugmentation, RandomLens))
         return {"cube": torch.ones(())} if ours else {}
 
     @staticmethod
@@ -318,7 +320,7 @@ def _in_linear_light(children: Iterable[tuple[str, nn.Module]]) -> set[str]:
             linear = True
         elif isinstance(module, ToneCurve):
             linear = False
-        elif linear and isinstance(module, CameraAugmentation):
+        elif linear and isinstance(module, (CameraAugmentation, RandomLens)):
             found.add(name)
     return found
 

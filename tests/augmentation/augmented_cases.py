@@ -72,9 +72,7 @@ def small_camera() -> Camera:
         optics.CircularAperture(diameter=2 * mm), optics.ThinLens(focal_length=8 * mm), focus_distance=2.0
     )
     return Camera(
-        optics.Imaging(
-            lens, pixel_pitch=10 * um, psf_shape=(9, 9), propagator="fresnel", integrate=False, bands=6
-        ),
+        optics.Imaging(lens, pixel_pitch=10 * um, psf_shape=(9, 9), propagator="fresnel", integrate=False, bands=6),
         sensor.ColourFilter.kodak(),
         sensor.Mosaic("RGGB"),
         sensor.Exposure(),
@@ -92,6 +90,21 @@ def small_camera() -> Camera:
 def shared_camera(**arguments: Any) -> nn.Module:
     """One RandomCamera for the same arguments in all tests: what it planned is kept."""
     return KC.RandomCamera(cameras=(small_camera(),), **arguments)
+
+
+@functools.cache
+def small_lens() -> optics.CompoundLens:
+    """A single lens of 0.6 mm: few rays, and pixels that are not many wavelengths wide."""
+    glass = optics.Glass(1.5168, 64.2)
+    front = optics.Surface(radius=0.6 * mm, thickness=0.1 * mm, glass=glass, semi_diameter=0.06 * mm, stop=True)
+    back = optics.Surface(radius=-0.6 * mm, thickness=0.0, semi_diameter=0.1 * mm)
+    return optics.CompoundLens(front, back, focus_distance=2.0).requires_grad_(False)
+
+
+@functools.cache
+def shared_lens(**arguments: Any) -> nn.Module:
+    """One RandomLens for the same arguments in all tests: its PSFs are kept."""
+    return KC.RandomLens(small_lens(), **arguments)
 
 
 LENS = {"pixel_pitch": 10 * um, "outside": 0.05}
@@ -116,6 +129,7 @@ CASES: tuple[Case, ...] = (
         {"k1": (-0.2, -0.1), "k2": (0.01, 0.05), "p1": (0.001, 0.01), "p2": (0.001, 0.01)},
         geometric=True,
     ),
+    Case("lens", shared_lens, fixed={"reach": (0.2, 0.4), "steps": 2}, geometric=True),
     Case("vignetting", KC.RandomVignetting, {"field": (40.0, 80.0), "shade": (0.1, 0.4)}),
     Case("bayer", KC.RandomBayer, cube_to_picture=True),
     Case("x_trans", KC.RandomBayer, fixed={"pattern": "x_trans"}, cube_to_picture=True),

@@ -316,9 +316,7 @@ class TestDepth:
 
     def test_by_name(self) -> None:
         x, depth, classes = picture(2, 3, *SQUARE), step_depth(2), torch.full((2, 1, *SQUARE), 1.0)
-        sequence = KC.CameraSequential(
-            K.RandomHorizontalFlip(p=1.0), defocus(), data_keys=None, depth_key="mask_depth"
-        )
+        sequence = KC.CameraSequential(K.RandomHorizontalFlip(p=1.0), defocus(), data_keys=None, depth_key="mask_depth")
         for order in (("image", "mask", "mask_depth"), ("image", "name", "mask_depth", "mask")):
             given = {"image": x, "mask": classes, "mask_depth": depth, "name": "a picture"}
             out = sequence({key: given[key] for key in order})
