@@ -26,7 +26,10 @@ def test_arrays_become_float32(name: str) -> None:
     assert KC.corrupt(PIXELS, "defocus", severity=2).dtype == torch.float32
 
 
-@pytest.mark.parametrize("name", sorted(KC.CORRUPTIONS))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow) if name == "real_lens" else name for name in sorted(KC.CORRUPTIONS)],
+)
 def test_a_corruption_does_not_depend_on_the_batch(name: str) -> None:
     alone = KC.corrupt(PICTURE, name, severity=3)
     assert torch.equal(KC.corrupt(PICTURE.expand(3, -1, -1, -1), name, severity=3)[:1], alone)

@@ -15,6 +15,7 @@ from torch import Tensor
 import kcam.augmentation as KC
 
 NAMES = tuple(KC.CORRUPTIONS)
+SOME = [pytest.param(name, marks=pytest.mark.slow) if name == "real_lens" else name for name in NAMES]  # it traces
 SEEDED = ("aberration", "shot_read_noise", "fixed_pattern")
 
 
@@ -30,7 +31,7 @@ def rms(name: str, severity: int, picture: Tensor) -> float:
 
 
 @pytest.mark.parametrize("severity", [1, 2, 3, 4, 5])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME)
 def test_every_row(name: str, severity: int) -> None:
     for x in (photograph("coffee")[..., :33, :47], photograph("coffee")[0, :, :32, :32].double()):
         before, state = x.clone(), torch.get_rng_state()
@@ -44,7 +45,7 @@ def test_every_row(name: str, severity: int) -> None:
         assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME)
 def test_a_higher_severity_is_worse(name: str) -> None:
     errors = [rms(name, severity, photograph("coffee")) for severity in (1, 2, 3, 4, 5)]
     for milder, stronger in pairwise(errors):
@@ -52,7 +53,7 @@ def test_a_higher_severity_is_worse(name: str) -> None:
     assert errors[0] > 1 / 255  # of the range: less than a step of 8 bits on average is no corruption
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME)
 def test_a_seed_decides(name: str) -> None:
     x = photograph("coffee")[..., :32, :32]
     torch.manual_seed(1)
