@@ -23,6 +23,7 @@ DEGREES = (12, 16, 20)
 ENOUGH = 2e-4  # of a wavelength: what a fit of a wavefront may leave (rms)
 _FEWEST = 12  # rays that pass
 _LESS = 12.0  # exponent of the weight for a clearance below 0
+_FAR = -0.3  # clearance of rays that are left out: they may come from anywhere, and widen what is fitted
 _BEYOND = 1.12  # of the stop's radius, to which rays are sent
 _RINGS, _SPOKES = 21, 49
 
@@ -121,6 +122,7 @@ def fit(
                 f"only {int(passed.min())} of {dx.shape[1]} rays of a point pass this lens, too few to know its pupil. "
                 "Is the field too wide, or a semi_diameter too small?"
             )
+        alive = alive & (least > _FAR)
         weights = torch.exp(_LESS * least.clamp(max=0)).clamp(min=1e-3) * alive
         low, high = torch.where(alive, dy, math.inf).amin(1), torch.where(alive, dy, -math.inf).amax(1)
         half = torch.stack([torch.where(alive, dx.abs(), 0.0).amax(1), (high - low) / 2], dim=1).clamp(min=1e-9)
