@@ -33,7 +33,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "rich" would take [pixels] for a style, and drop it
 )
-LENS_SUFFIXES = (".zmx", ".json")
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; without it, everything'
@@ -118,15 +117,16 @@ def open_scene(name: str, *, size: int) -> Scene:
 def open_lens(name: str, *, focus: str) -> CompoundLens:
     """A preset by its name, or a prescription by its path, focused at a distance; of a file "" is its own."""
     from kcam.optics import CompoundLens
+    from kcam.optics.compound.files import SUFFIXES
     from kcam.optics.compound.presets import PRESETS
 
-    if Path(name).suffix.lower() in LENS_SUFFIXES:
+    if Path(name).suffix.lower() in SUFFIXES:
         return CompoundLens.from_file(name, focus_distance=length(focus, name="focus") if focus else None)
     if name in PRESETS:
         return CompoundLens.preset(name, focus_distance=length(focus or "inf", name="focus"))
     raise ValueError(
         f'unknown lens "{name}": expected a preset ({", ".join(sorted(PRESETS))}) or a file that ends in '
-        f"{' or '.join(LENS_SUFFIXES)}."
+        f"{' or '.join(SUFFIXES)}."
     )
 
 

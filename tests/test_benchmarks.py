@@ -182,7 +182,7 @@ def augmented(tmp_path_factory: pytest.TempPathFactory) -> dict:
 @pytest.mark.slow
 def test_every_augmentation_is_raced_on_pictures_and_cubes(augmented):
     names = {name for name in KC.__all__ if name.startswith("Random")}
-    for channels, without in ((3, set()), (28, {"RandomColourMatrix"})):
+    for channels, without in ((3, set()), (28, {"RandomColourMatrix", "RandomLens"})):
         lines = {line["augmentation"]: line for line in augmented["lines"] if line["channels"] == channels}
         assert lines.keys() == names - without
         for name, line in lines.items():
@@ -194,7 +194,8 @@ def test_every_augmentation_is_raced_on_pictures_and_cubes(augmented):
 @pytest.mark.slow
 def test_the_straightforward_way_gives_the_same_picture(augmented):
     exact = [line for line in augmented["lines"] if line["difference"] is not None]
-    assert len(exact) == 2 * 12 - 1
+    # what is drawn from the generator (noise, pattern, the camera) is not compared; two take no cubes
+    assert len(exact) == 2 * 13 - 2
     for line in exact:
         # measured 6e-6: float32 and the PSFs' sampling, each promised to 1e-4 or better; 0 for most
         assert line["difference"] < 5e-5, line["augmentation"]

@@ -22,6 +22,7 @@ from kcam.compiled import uncompiled
 from kcam.inputs import describe
 from kcam.optics import CompoundLens, Imaging
 from kcam.optics.compound.distortion import ImageHeights
+from kcam.optics.compound.files import SUFFIXES
 from kcam.optics.compound.presets import PRESETS
 from kcam.optics.rendering.borders import BORDERS, border_index
 from kcam.scene import Scene
@@ -35,7 +36,6 @@ _NODES = 4  # cells of PSFs along the longer side
 _CLOSEST = 8  # pixels between nodes, at least
 _FIXED_POINT, _CLOSE = 200, 1e-9  # steps of the inverse at most, and of the reach
 LENSES = ("cooke_triplet", "ef50", "wide_angle", "phone")
-_SUFFIXES = (".zmx", ".json")
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ def _opened(lens: object, *, focus: float, stops: float) -> CompoundLens:
         raise TypeError(f"lens must be names, files or an optics.CompoundLens, got {describe(lens)}.")
     if _is_preset(lens):
         opened = CompoundLens.preset(str(lens), focus_distance=focus)
-    elif Path(lens).suffix.lower() in _SUFFIXES:
+    elif Path(lens).suffix.lower() in SUFFIXES:
         opened = CompoundLens.from_file(lens, focus_distance=focus)
     else:
         raise ValueError(f"unknown lens {str(lens)!r}. There are: {', '.join(PRESETS)}; or give a .zmx or .json file.")

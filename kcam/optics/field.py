@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from kcam.optics.regions import pixel_positions
 from kcam.optics.rendering.borders import extend
 from kcam.optics.rendering.resampling import Resampling, resampling
 from kcam.optics.rendering.zones import Axis, blend
@@ -99,13 +100,12 @@ class FieldPicture:
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Where distortion brings them, planes times the relative illumination there: nodes share out what is left."""
-        height, width = picture = (planes.shape[-2], planes.shape[-1])
+        picture = (planes.shape[-2], planes.shape[-1])
         moves = self.distortion(picture)
         if moves is not None:
             planes, shares = moves(planes), None if shares is None else moves(shares)
-        y, x = (torch.arange(n, dtype=torch.float64, device=planes.device) - (n - 1) / 2 for n in (height, width))
-        places = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
-        return planes * self.psfs.illumination(self._on_sensor(places)).to(planes), shares
+        places = self._centre + pixel_positions(picture, self.pixels.pitch)
+        return planes * self.psfs.illumination(places).to(planes), shares
 
     def distortion(self, picture: tuple[int, int]) -> Resampling | None:
         """From the scene's pixels to the picture's; None where nothing moves."""
@@ -127,11 +127,10 @@ class FieldPicture:
         with torch.no_grad():
             planes, shares = self.moved(planes, shares)
             picture = (planes.shape[-2], planes.shape[-1])
-            apart, error = self.spacing or 0, 0.0
             if self.spacing is None:
                 apart, error = self.apart(planes, shares)
             else:
-                error = self.blending_error(planes, shares, apart)
+                apart, error = self.spacing, self.blending_error(planes, shares, self.spacing)
             rows, columns = (
                 len(Axis.of(n, m, apart=apart).nodes) for n, m in zip(picture, self.pixels.shape, strict=True)
             )

@@ -19,9 +19,10 @@ from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query, Sampling, residual_vergence
 from kcam.optics.propagation.sampling import KAPPA, MAX_PUPIL_SAMPLES
 from kcam.optics.propagation.table import choose
-from kcam.optics.source import OUTSIDE_SHARE, Defocus, PixelGrid, Points
+from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
+OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 TESTED_F_NUMBERS = (1.8, 100.0)
 """Within these the non-paraxial PSF is held to Rayleigh-Sommerfeld.
 

@@ -120,6 +120,18 @@ def chebyshev(v: Tensor, degree: int) -> Tensor:
     return torch.stack(terms[: degree + 1])
 
 
+def chebyshev_points(count: int) -> Tensor:
+    """Zeros of T_count, falling from 1 to -1, (count,): where to know what is to be a polynomial. The first half of an
+    even count, for what is even.
+    """
+    return torch.cos((torch.arange(count, dtype=torch.float64) + 0.5) * (math.pi / count))
+
+
+def chebyshev_between(low: Tensor, high: Tensor, count: int) -> Tensor:
+    """The same for a range, (count,)."""
+    return (low + high) / 2 + (high - low) / 2 * chebyshev_points(count).to(low.device)
+
+
 MOST_NODES = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
 
 

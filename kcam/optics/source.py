@@ -20,7 +20,6 @@ from torch import Tensor
 from kcam.context import Photometric
 
 _CPU = torch.device("cpu")
-OUTSIDE_SHARE = 1e-3  # of the light that the default window may leave out
 
 
 @dataclass(frozen=True)

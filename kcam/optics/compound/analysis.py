@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcam.inputs import as_values
 from kcam.optics.compound.images import Frame
-from kcam.optics.compound.pupil import PupilFit, opening
+from kcam.optics.compound.pupil import OVERFILL, PupilFit, opening
 from kcam.optics.compound.tracing import Rays
 from kcam.optics.numerics import fast_length, phasor, squared
 from kcam.optics.propagation import sampling
@@ -20,7 +20,6 @@ SPECTRAL_LINES = (486.1e-9, 546.1e-9, 656.3e-9)
 CRITERIA = ("rms",)
 """What `CompoundLens.refocus` can make least."""
 STEP = 1e-5  # of the stop's radius: between the rays whose directions tell how much light one stands for
-_OVERFILL = 1.12  # of the stop's radius, to which rays are sent: seen from off the axis the stop is no ellipse
 _RIM = 7  # samples of a grid beyond the pupil's edge, where the edge's low-pass ends
 _COARSE = 65  # samples across a pupil that tell how finely it must be sampled
 _FEWEST, _FEWEST_OF_MAP = 96, 384  # samples across a pupil for a curve, and for a map, which has no weights at the edge
@@ -82,7 +81,7 @@ def hexapolar(rings: int) -> tuple[Tensor, Tensor, Tensor]:
         raise ValueError(f"rays need rings >= 2 around the chief ray, got {rings}. Use 12, which are 469 rays.")
     ring = torch.cat([torch.full((max(6 * k, 1),), k, dtype=torch.float64) for k in range(rings + 1)])
     angle = torch.cat([(torch.arange(max(6 * k, 1)) + 0.5) / max(6 * k, 1) for k in range(rings + 1)]) * 2 * math.pi
-    step = _OVERFILL / (rings + 0.5)
+    step = OVERFILL / (rings + 0.5)
     area = torch.where(ring == 0, math.pi * step**2 / 4, math.pi * step**2 / 3)
     return step * ring * angle.double().sin(), step * ring * angle.double().cos(), area
 

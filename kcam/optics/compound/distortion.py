@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import chebyshev
+from kcam.optics.numerics import chebyshev, chebyshev_points
 
 _SMALL = 1e-11  # of the sum: terms that move light by less are left out
-NODES = 16
+_NODES = 16
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Even:
 
 def chebyshev_radii(reach: float) -> Tensor:
     """Where to know an `Even` function, (n,)."""
-    return reach * torch.cos((torch.arange(NODES, dtype=torch.float64) + 0.5) * (math.pi / (2 * NODES)))
+    return reach * chebyshev_points(2 * _NODES)[:_NODES]
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field, replace
 
@@ -12,6 +13,7 @@ from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
 from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, images
 from kcam.optics.compound.pupil import PupilFit
 from kcam.optics.compound.table import PupilTable, lagrange_weights
+from kcam.optics.numerics import chebyshev_between
 from kcam.optics.source import PixelGrid
 
 _LOOKED = 9  # heights at which a window is asked for
@@ -59,14 +61,16 @@ class FieldPSFs:
     reach: float  # of places, from the axis [m]
 
     kept: dict[tuple[object, ...], tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
-    kept_curves: dict[str, Even] = field(default_factory=dict, repr=False)
     kept_banks: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
-        heights = torch.cat([radii * self.image_heights.over_radius.at(radii**2), radii.new_zeros(1)])
-        grid = torch.meshgrid(heights, self.vergences, wavelengths, indexing="ij")
+        grid = torch.meshgrid(self._heights(radii), self.vergences, wavelengths, indexing="ij")
         return self.table.at(*(part.flatten() for part in grid))
+
+    def _heights(self, radii: Tensor) -> Tensor:
+        """Of the object points whose images lie so far from the axis (F,), and of that on it: (F + 1,)."""
+        return torch.cat([radii * self.image_heights.over_radius.at(radii**2), radii.new_zeros(1)])
 
     def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False, mixing: Tensor | None = None) -> Tensor:
         """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
@@ -126,12 +130,10 @@ class FieldPSFs:
         mixing = every if mixing is None else mixing.double().cpu()
         mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
         truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), self._bank(places, self.wavelengths, pixels))
-        low, high = self.wavelengths.aminmax()
         for n in _COLOURS:
             if n >= len(self.wavelengths):
                 break
-            turned = torch.cos(math.pi * (torch.arange(n, dtype=torch.float64) + 0.5) / n)
-            nodes = (low + high) / 2 + (high - low) / 2 * turned
+            nodes = chebyshev_between(*self.wavelengths.aminmax(), n)
             shares = lagrange_weights(nodes, self.wavelengths)
             found = torch.einsum("mn,fznhw->fzmhw", (mixing @ shares).to(truth), self._bank(places, nodes, pixels))
             off = float((found - truth).abs().sum((-2, -1)).max())
@@ -168,14 +170,17 @@ class FieldPSFs:
         """Irradiance of an even scene at places (..., 2) [m], over that on the axis: at the middle wavelength and
         vergence, by a smooth curve, as what varies is to be divided out.
         """
-        if "illumination" not in self.kept_curves:
-            radii = chebyshev_radii(max(self.reach, 1e-9))
-            middle = [part[len(part) // 2 : len(part) // 2 + 1] for part in (self.vergences, self.wavelengths)]
-            heights = torch.cat([radii * self.image_heights.over_radius.at(radii**2), radii.new_zeros(1)])
-            fitted = self.table.at(heights, *(part.expand(len(heights)) for part in middle))
-            light = areas(fitted, Frame.upright(fitted))
-            self.kept_curves["illumination"] = Even.through(light[:-1] / light[-1], radii, reach=max(self.reach, 1e-9))
-        return self.kept_curves["illumination"].at(places.square().sum(-1))
+        return self._illumination.at(places.square().sum(-1))
+
+    @functools.cached_property
+    def _illumination(self) -> Even:
+        reach = max(self.reach, 1e-9)
+        radii = chebyshev_radii(reach)
+        heights = self._heights(radii)
+        middle = (part[len(part) // 2].expand(len(heights)) for part in (self.vergences, self.wavelengths))
+        fitted = self.table.at(heights, *middle)
+        light = areas(fitted, Frame.upright(fitted))
+        return Even.through(light[:-1] / light[-1], radii, reach=reach)
 
     @torch.no_grad()
     def blur(self) -> float:

@@ -13,6 +13,7 @@ from kcam.optics.compound.surface import Surface
 from kcam.optics.numerics import Scalar, float64
 
 _FORMATS = {".zmx": zemax, ".json": optiland}
+SUFFIXES = tuple(_FORMATS)
 
 
 def read_lens(path: str | os.PathLike[str], *, focused: bool) -> Layout:

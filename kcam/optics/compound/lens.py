@@ -236,16 +236,22 @@ class CompoundLens(nn.Module):
 
     def _nodes(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> _Nodes:
         """Chief rays of heights (F,), vergences (Z,) and wavelengths (L,). Raises: ValueError where one is lost."""
-        indices = [index.to(heights.device)[None, None, :, None] for index in self.indices(wavelengths)]
-        t, v = heights[:, None, None, None], vergences[None, :, None, None]
-        aim, across, along = self.aimed(t, v, indices)
-        chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
-        if not bool(chief.alive.all()):
-            height = float(t.expand(chief.alive.shape)[~chief.alive].max())
+        nodes = self._chiefs(wavelengths, vergences, heights)
+        alive = nodes.chief.alive
+        if not bool(alive.all()):
+            height = float(nodes.heights.expand(alive.shape)[~alive].max())
             raise ValueError(
                 f"the chief ray of a point at {height:.3g} (Y / D) misses a surface or is totally reflected: the field "
                 "of this lens is smaller. Use smaller fields."
             )
+        return nodes
+
+    def _chiefs(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> _Nodes:
+        """The same where some may be lost: `chief.alive` says which are not."""
+        indices = [index.to(heights.device)[None, None, :, None] for index in self.indices(wavelengths)]
+        t, v = heights[:, None, None, None], vergences[None, :, None, None]
+        aim, across, along = self.aimed(t, v, indices)
+        chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
         return _Nodes(indices, t, v, aim, across, along, chief)
 
     def _at_sensor(self, rays: Rays, indices: list[Tensor]) -> Rays:
@@ -413,7 +419,7 @@ class CompoundLens(nn.Module):
         return found[torch.arange(len(places)), torch.arange(len(places))]
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
-        """The window that holds all but 0.1 % of the light of points on the axis: see `PSFSource`."""
+        """The window that holds all but 0.5 % of the light of points, on the axis unless they have positions."""
         reach = 0.0 if points.positions is None else float(points.positions.norm(dim=1).max())
         return self.over_field(reach, points.vergences, wavelengths).window(pixels)
 
@@ -648,17 +654,14 @@ class CompoundLens(nn.Module):
         """
         self.check()
         vergences = 1 / check_distances(distance).reshape(-1)
-        indices = [index[None, None, :, None] for index in self.indices(self._focus_line())]
         low, high = 0.0, math.radians(_WIDEST)
         with torch.no_grad():
             for _ in range(_NESTED):
                 angles = torch.linspace(low, high, _INTERVALS + 1, dtype=torch.float64)
                 heights = torch.cat([angles.new_zeros(1), angles.tan()])
-                t, v = heights[:, None, None, None], vergences[None, :, None, None]
-                aim, across, along = self.aimed(t, v, indices)
-                chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
-                light = self._sent(_Nodes(indices, t, v, aim, across, along, chief), rings=8)[1].sum(-1)[:, 0, 0]
-                passes = chief.alive[:, 0, 0, 0] & (light > least * light[0])
+                nodes = self._chiefs(self._focus_line(), vergences, heights)
+                light = self._sent(nodes, rings=8)[1].sum(-1)[:, 0, 0]
+                passes = nodes.chief.alive[:, 0, 0, 0] & (light > least * light[0])
                 fails = torch.nonzero(~passes[1:])
                 if not len(fails):
                     return math.tan(high)

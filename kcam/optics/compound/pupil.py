@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import chebyshev
+from kcam.optics.numerics import chebyshev, chebyshev_points
 from kcam.optics.pupil.rim import edge_profile
 
 DEGREES = (12, 16, 20)
@@ -24,7 +24,7 @@ ENOUGH = 2e-4  # of a wavelength: what a fit of a wavefront may leave (rms)
 _FEWEST = 12  # rays that pass
 _LESS = 12.0  # exponent of the weight for a clearance below 0
 _FAR = -0.3  # clearance of rays that are left out: they may come from anywhere, and widen what is fitted
-_BEYOND = 1.12  # of the stop's radius, to which rays are sent
+OVERFILL = 1.12  # of the stop's radius, to which rays are sent: seen from off the axis the stop is no ellipse
 _RINGS, _SPOKES = 21, 49
 
 
@@ -78,8 +78,7 @@ class PupilFit:
 
 def rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor]:
     """Coordinates x >= 0, y in a disc a little larger than 1, (R,) each: rings at Chebyshev radii, all spokes."""
-    k = torch.arange(_RINGS, dtype=torch.float64, device=device)
-    radius = _BEYOND * torch.cos((2 * k + 1) / (4 * _RINGS) * math.pi)
+    radius = OVERFILL * chebyshev_points(2 * _RINGS)[:_RINGS].to(device)
     angle = torch.linspace(0, math.pi, _SPOKES, dtype=torch.float64, device=device)
     x, y = radius[:, None] * angle.sin(), radius[:, None] * angle.cos()
     return x.flatten().clamp(min=0), y.flatten()
@@ -128,7 +127,7 @@ def fit(
         half = torch.stack([torch.where(alive, dx.abs(), 0.0).amax(1), (high - low) / 2], dim=1).clamp(min=1e-9)
         centre = (low + high) / 2
         others = least[:, None].expand_as(clearances)  # surfaces that clip nothing that the rest lets pass are left out
-        clips = ((clearances <= others + 1e-12) & (others < 0.02) & (others > -0.3)).any(0).any(1)
+        clips = ((clearances <= others + 1e-12) & (others < 0.02) & (others > _FAR)).any(0).any(1)
     clearances = clearances[:, clips]
     for degree in DEGREES:
         rows, columns = _orders(degree)

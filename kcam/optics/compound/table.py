@@ -17,6 +17,7 @@ from torch import Tensor
 
 from kcam.optics.compound.images import Frame, areas
 from kcam.optics.compound.pupil import PupilFit, odd_terms
+from kcam.optics.numerics import chebyshev_between, chebyshev_points
 
 Fitted = Callable[[Tensor, Tensor, Tensor], PupilFit]
 """Pupils of F x Z x L nodes: heights (F,), vergences (Z,), wavelengths (L,)."""
@@ -94,7 +95,7 @@ def _table(fitted: Fitted, highest: float, vergences: Tensor, wavelengths: Tenso
     heights = torch.zeros(1, dtype=torch.float64)
     if highest > 0:
         n = _HEIGHTS[counts[0]]
-        heights = _BEYOND * highest * torch.cos(math.pi * (torch.arange(n, dtype=torch.float64) + 0.5) / (2 * n))
+        heights = _BEYOND * highest * chebyshev_points(2 * n)[:n]
     near, colours = _nodes(vergences, _OTHERS[counts[1]]), _nodes(wavelengths**-2, _OTHERS[counts[2]]) ** -0.5
     return PupilTable(heights, near, colours, _BEYOND * highest, fitted(heights, near, colours))
 
@@ -106,9 +107,7 @@ def _nodes(values: Tensor, count: int) -> Tensor:
     own = ordered[torch.cat([ordered.new_ones(1, dtype=torch.bool), ordered.detach().diff() > 0])]
     if len(own) <= max(_ALL, count):
         return own
-    low, high = own.detach().aminmax()
-    turned = torch.cos(math.pi * (torch.arange(count, dtype=torch.float64, device=own.device) + 0.5) / count)
-    return (low + high) / 2 + (high - low) / 2 * turned
+    return chebyshev_between(*own.detach().aminmax(), count)
 
 
 def _grows(table: PupilTable, counts: list[int], axis: int) -> bool:

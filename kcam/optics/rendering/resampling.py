@@ -46,13 +46,12 @@ class Resampling:
 def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resampling | None:
     """That of a picture whose middle is (0, 0), x to the right and y down [pixels]; None where nothing moves."""
     height, width = picture
-    with torch.no_grad():
-        y, x = (_coarse(n) for n in picture)
-        places = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
-        if float((ideal(places) - places).abs().max()) < _UNMOVED:
-            return None
-    x, y = _coarse(width), _coarse(height)
-    down = ideal(torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1))[..., 1]
+    y, x = (_coarse(n) for n in picture)
+    places = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+    moved = ideal(places)
+    if float((moved.detach() - places).abs().max()) < _UNMOVED:
+        return None
+    down = moved[..., 1]
     # where the column x meets the scene's row y: y' with ideal_y(x, y') = y
     row = y[:, None].expand(-1, len(x))
     for _ in range(_FIXED_POINT):
