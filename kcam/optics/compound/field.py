@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
-from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, images
+from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, axis_light, images
 from kcam.optics.compound.pupil import PupilFit
-from kcam.optics.compound.table import PupilTable, lagrange_weights
-from kcam.optics.numerics import chebyshev_between
+from kcam.optics.compound.table import PupilTable
+from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.optics.source import PixelGrid
 
 _LOOKED = 9  # heights at which a window is asked for
@@ -40,13 +40,11 @@ def bank(
     fitted: of F + 1 x Z x L pupils; those on the axis come last, and their light counts as 1.
     """
     places, vergences, count = moved.shape
-    towards = directions.repeat_interleave(vergences * count, dim=0)
-    frame = Frame.of(fitted, torch.cat([towards, towards.new_tensor([[0.0, 1.0]]).expand(vergences * count, 2)]))
-    own, axis = torch.arange(len(frame.half)).split([len(towards), vergences * count])
-    light = areas(fitted, frame, axis).repeat(places)
-    colours = wavelengths.repeat(places * vergences)
-    offsets = moved.flatten()[:, None] * towards
-    found = images(fitted, frame[own], colours, offsets, pixels, relative_to=light, how=how, whole=whole)
+    towards = directions.repeat_interleave(vergences, dim=0)
+    of_place, axis = torch.arange(len(fitted.centre)).view(-1, count).split([places * vergences, vergences])
+    light = axis_light(fitted, axis, wavelengths).repeat(places, 1)
+    offsets = moved.view(-1, count, 1) * towards[:, None]
+    found = images(fitted, of_place, towards, wavelengths, offsets, pixels, relative_to=light, how=how, whole=whole)
     return found.view(places, vergences, count, *pixels.shape)
 
 

@@ -19,14 +19,16 @@ import torch
 from scipy.interpolate import BarycentricInterpolator
 from torch import Tensor
 
-from kcam.optics.compound.pupil import PupilFit, opening
-from kcam.optics.numerics import fast_length, phasor, squared
+from kcam.optics.compound.pupil import Openings, PupilFit, edge_distance, opening
+from kcam.optics.numerics import fast_length, lagrange_weights, phasor, squared
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.pixels import Pixels
 from kcam.optics.source import PixelGrid
 
 _SHARES = 100  # of the light, of which it is known how far they fall
 _LOOK = 41  # points across a pupil, to see what of it is open
+_ALIKE = 1.2  # wavelengths that differ by no more than this factor share the grid of their pupils
+_EDGES = 3  # of these, at which the edges of a pupil are looked at
 _ROOM = 12  # samples of a grid beyond what is open, for the low-pass of its edge
 _ACROSS = 52  # samples across what is open, at least: its edge is spread over twelve
 _AREA_SAMPLES = 128
@@ -42,14 +44,14 @@ class Closeness:
 
 
 CLOSE = Closeness()
-QUICK = Closeness(kappa=2.0, margin=2)
+QUICK = Closeness(kappa=1.5, margin=2)
 """Takes half of the time, and is at most `QUICK_ERROR` of a PSF's light from `CLOSE` (L1)."""
 QUICK_ERROR = 1e-3  # measured: at most 8e-4, Cooke triplet and EF50 at f/4
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Where N pupils are open, by squares along the sensor's axes; no derivative passes through it.
+    """Where pupils are open, by N squares along the sensor's axes; no derivative passes through it.
 
     directions (N, 2): from the axis to the image, on the sensor. middle (N, 2), half (N,): of the squares, in direction
     cosines. slope (N,): how far the wavefront sends light from the chief ray's image, at most [m]. slopes (N, Q): of
@@ -64,10 +66,13 @@ class Frame:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, fitted: PupilFit, directions: Tensor) -> Frame:
-        """Seen on a coarse grid. Raises: ValueError for a pupil that nothing passes."""
-        nodes = torch.arange(len(fitted.centre), device=fitted.centre.device)
-        parts = [_looked(fitted, own, directions[own]) for own in nodes.split(max(1, _AT_ONCE // (8 * _LOOK**2)))]
+    def of(cls, fitted: PupilFit, directions: Tensor, nodes: Tensor | None = None) -> Frame:
+        """Seen on a coarse grid; nodes (N, E): of pupils that share a square, None for one each. Raises: ValueError for
+        a pupil that nothing passes.
+        """
+        nodes = torch.arange(len(fitted.centre), device=fitted.centre.device)[:, None] if nodes is None else nodes
+        length = max(1, _AT_ONCE // (8 * _LOOK**2 * nodes.shape[1]))
+        parts = [_looked(fitted, *own) for own in zip(nodes.split(length), directions.split(length), strict=True)]
         return cls(directions, *(torch.cat(part) for part in zip(*parts, strict=True)))
 
     @classmethod
@@ -84,21 +89,23 @@ def _looked(fitted: PupilFit, nodes: Tensor, directions: Tensor) -> tuple[Tensor
     side = torch.linspace(-1, 1, _LOOK, dtype=torch.float64, device=directions.device)
     r, centre = fitted.radius[nodes, None, None], fitted.centre[nodes, None, None]
     dx, dy = torch.broadcast_tensors(r * side, centre + r * side[:, None])
-    path, clearances = fitted.at(nodes, dx, dy)
-    passes = (clearances > 0).all(1)
-    if not bool(passes.flatten(1).any(1).all()):
+    path, clearances = (
+        part.unflatten(0, nodes.shape) for part in fitted.at(nodes.flatten(), dx.flatten(0, 1), dy.flatten(0, 1))
+    )
+    passes = (clearances > 0).all(2)
+    if not bool(passes.flatten(2).any(2).all()):
         raise ValueError("a point's light is stopped completely. Use smaller fields, or larger semi-diameters.")
     step = r * (2 / (_LOOK - 1))
     slope = torch.stack(torch.gradient(path, dim=(-2, -1))).square().sum(0).sqrt() / step
-    ordered = torch.where(passes, slope, math.inf).flatten(1).sort(dim=1).values
-    count = passes.flatten(1).sum(1, keepdim=True)
+    ordered = torch.where(passes, slope, math.inf).flatten(2).sort(dim=2).values
+    count = passes.flatten(2).sum(2, keepdim=True)
     rank = ((torch.arange(_SHARES) + 0.5) / _SHARES * count).long()  # each of as many of the rays that pass
-    slopes, slope = ordered.gather(1, rank), ordered.gather(1, count - 1)[:, 0]
-    x, y = (part[:, None, None] for part in directions.unbind(1))
+    slopes, slope = ordered.gather(2, rank).amax(1), ordered.gather(2, count - 1)[..., 0].amax(1)
+    x, y = (part[:, None, None, None] for part in directions.unbind(1))
     place = torch.stack([dx * y + dy * x, dy * y - dx * x])  # on the sensor's axes: `_meridional` undone
-    low = torch.where(passes, place, math.inf).flatten(2).amin(2)
-    high = torch.where(passes, place, -math.inf).flatten(2).amax(2)
-    half = ((high - low).amax(0) / 2 + step[:, 0, 0]).clamp(max=1.5 * fitted.radius[nodes])
+    low = torch.where(passes, place, math.inf).flatten(3).amin((2, 3))
+    high = torch.where(passes, place, -math.inf).flatten(3).amax((2, 3))
+    half = ((high - low).amax(0) / 2 + step[..., 0, 0].amax(1)).clamp(max=1.5 * fitted.radius[nodes].amax(1))
     half = 2 ** (torch.ceil(16 * torch.log2(half) + 0.5) / 16)  # in steps: it does not follow small changes
     grain = half / 16
     return (((low + high).T / 2) / grain[:, None]).round() * grain[:, None], half, slope, slopes
@@ -121,36 +128,70 @@ def _from_chebyshev(degree: int, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _known(
-    fitted: PupilFit, nodes: Tensor, frame: Frame, reach: Tensor, offsets: Tensor | None = None
+    fitted: PupilFit, nodes: Tensor, frame: Frame, reach: Tensor | float, offsets: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Wavefronts (n, G, G) [m], rows along +y, and clearances (n, S, G, G) at the Chebyshev points of squares; reach:
-    of these (n,), from the middle of their frames. offsets (n, 2) [m]: of what is to be seen in the image's middle.
+    """Wavefronts (N, L, G, G) [m], rows along +y, and clearances (N, L, S, G, G) at the Chebyshev points of N squares,
+    of pupils with indices `nodes` (N, L); reach: of these squares, from the middle of their frames. offsets (N, L, 2)
+    [m]: of what is to be seen in the image's middle.
     """
-    points = _from_chebyshev(fitted.degree, 1)[0].to(reach.device)
+    points = _from_chebyshev(fitted.degree, 1)[0].to(frame.half.device)
+    reach = torch.as_tensor(reach, device=points.device).expand(len(nodes))
     x, y = (frame.middle[:, k, None] + reach[:, None] * points for k in (0, 1))
     x, y = torch.broadcast_tensors(x[:, None, :], y[:, :, None])
-    path, clearances = fitted.at(nodes, *_meridional(x, y, frame.directions))
+    places = [part.repeat_interleave(nodes.shape[1], dim=0) for part in _meridional(x, y, frame.directions)]
+    path, clearances = (part.unflatten(0, nodes.shape) for part in fitted.at(nodes.flatten(), *places))
     if offsets is not None:
-        path = path - offsets[:, 0, None, None] * x - offsets[:, 1, None, None] * y
+        path = path - offsets[..., :1, None] * x[:, None] - offsets[..., 1:, None] * y[:, None]
     return path, clearances
 
 
 def areas(fitted: PupilFit, frame: Frame, nodes: Tensor | None = None) -> Tensor:
-    """Of the open pupils in direction cosines: of all, or of those with an index in `nodes` (n,)."""
+    """Of the open pupils in direction cosines, (N,): of all, or of those with the indices `nodes` (N,)."""
     found = []
-    every = torch.arange(len(frame.half)) if nodes is None else nodes
-    for nodes in every.split(max(1, _AT_ONCE // _AREA_SAMPLES**2)):
-        own = frame[nodes]
+    nodes = torch.arange(len(frame.half)) if nodes is None else nodes
+    for part in torch.arange(len(nodes)).split(max(1, _AT_ONCE // _AREA_SAMPLES**2)):
+        own = frame[part]
         spacing = 2 * own.half / (_AREA_SAMPLES - _ROOM)
-        _, clearances = _known(fitted, nodes, own, spacing * (_AREA_SAMPLES / 2))
+        _, clearances = _known(fitted, nodes[part, None], own, spacing * (_AREA_SAMPLES / 2))
         matrix = _from_chebyshev(fitted.degree, _AREA_SAMPLES)[1].to(spacing.device)
-        found.append(opening(matrix @ clearances @ matrix.mT).sum((-2, -1)) * spacing**2)
+        found.append(opening(matrix @ clearances[:, 0] @ matrix.mT).sum((-2, -1)) * spacing**2)
     return torch.cat(found)
+
+
+def axis_light(fitted: PupilFit, nodes: Tensor, wavelengths: Tensor) -> Tensor:
+    """Areas of the open pupils with indices in nodes (R, L), of points on the axis."""
+    colours, weights = _seen_at(wavelengths)
+    nodes = nodes[:, colours]
+    upright = fitted.centre.new_tensor([[0.0, 1.0]]).expand(nodes.numel(), 2)
+    return (
+        areas(fitted, Frame.of(fitted, upright, nodes.reshape(-1, 1)), nodes.flatten()).view(len(nodes), -1) @ weights.T
+    )
+
+
+def _seen_at(wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices of a few wavelengths (E,) at which openings of pupils are looked at, and what each gives to all, (L, E).
+
+    An edge hardly moves from one end of a spectrum to the other, and by a polynomial.
+    """
+    turned = wavelengths.detach() ** -2  # in which indices are nearly straight
+    low, high = turned.aminmax()
+    wanted = torch.linspace(float(low), float(high), _EDGES, dtype=torch.float64, device=turned.device)
+    nearest = (turned - wanted[:, None]).abs().argmin(1).unique()
+    return nearest, lagrange_weights(turned[nearest], turned)
+
+
+def _together(wavelengths: Tensor, *, ratio: float) -> list[Tensor]:
+    """Indices of wavelengths of which the longest is so many times as long as the shortest, at most."""
+    order = wavelengths.detach().argsort()
+    steps = (wavelengths.detach()[order] / wavelengths.detach().min()).log() / max(math.log(ratio), 1e-9)
+    _, counts = steps.clamp(min=0).floor().unique_consecutive(return_counts=True)
+    return list(order.split(counts.tolist()))
 
 
 def images(
     fitted: PupilFit,
-    frame: Frame,
+    nodes: Tensor,
+    directions: Tensor,
     wavelengths: Tensor,
     offsets: Tensor,
     pixels: PixelGrid,
@@ -159,25 +200,44 @@ def images(
     how: Closeness = CLOSE,
     whole: bool = False,
 ) -> Tensor:
-    """PSFs (N, h, w) of nodes at wavelengths (N,), each moved by (N, 2) [m]; 1 is the light of an area in direction
-    cosines, (N,). whole: what leaves the window is put back into it.
+    """PSFs (R, L, h, w) of R points at wavelengths (L,), whose pupils have the indices `nodes` (R, L), turned towards
+    directions (R, 2), each moved by (R, L, 2) [m]; 1 is the light of an area in direction cosines, (R, L). whole: what
+    leaves the window is put back into it.
 
     The field at points p / q apart is one FFT of length F: of a pupil sampled at lambda q / (p F). Its rows that are
-    dark, and columns that nobody asks for, are left out.
+    dark, and columns that nobody asks for, are left out. Pupils of similar wavelengths are sampled alike, so that
+    q goes with 1 / lambda, and their edges are looked at a few times only.
     Raises: ValueError for blur that needs more than `sampling.MAX_PUPIL_SAMPLES`.
     """
-    margin = max(pixels.shape) // 2 + how.margin
-    reach = margin + (frame.slope + offsets.detach().abs().amax(1)) / pixels.pitch
+    groups = _together(wavelengths, ratio=_ALIKE if pixels.integrate else 1.0)  # of point samples q is to be whole
+    if len(groups) > 1:
+        found = [
+            images(
+                fitted,
+                nodes[:, own],
+                directions,
+                wavelengths[own],
+                offsets[:, own],
+                pixels,
+                relative_to=relative_to[:, own],
+                how=how,
+                whole=whole,
+            )
+            for own in groups
+        ]
+        return torch.cat(found, dim=1)[:, torch.cat(groups).argsort()]
+    colours, weights = _seen_at(wavelengths)
+    frame = Frame.of(fitted, directions, nodes[:, colours])
+    margin, shortest = max(pixels.shape) // 2 + how.margin, float(wavelengths.min())
+    reach = margin + (frame.slope + offsets.detach().abs().amax((1, 2))) / pixels.pitch
     alike: dict[tuple[int, float], list[int]] = defaultdict(list)
-    for index, (half, far, wavelength) in enumerate(
-        zip(frame.half.tolist(), reach.tolist(), wavelengths.tolist(), strict=True)
-    ):
+    for index, (half, far) in enumerate(zip(frame.half.tolist(), reach.tolist(), strict=True)):
         per_pixel = sampling.points_per_pixel(
-            pixel_pitch=pixels.pitch, semi_aperture=half, sensor_distance=1.0, wavelength=wavelength
+            pixel_pitch=pixels.pitch, semi_aperture=half, sensor_distance=1.0, wavelength=shortest
         )
         if not pixels.integrate:
             per_pixel = float(math.ceil(per_pixel))  # of which one is taken
-        fewest = math.ceil(_ACROSS * wavelength * per_pixel / (2 * half * pixels.pitch))
+        fewest = math.ceil(_ACROSS * shortest * per_pixel / (2 * half * pixels.pitch))
         wanted = math.ceil(how.kappa * far * per_pixel)
         length = fast_length(max(wanted, fewest, 2 * math.ceil(per_pixel * margin) + 1))
         if length > sampling.MAX_PUPIL_SAMPLES:
@@ -188,27 +248,32 @@ def images(
         alike[length, per_pixel].append(index)
     found, order = [], []
     for (length, per_pixel), indices in alike.items():
-        group = torch.tensor(indices)
-        own, colours = frame[group], wavelengths[group]
-        spacing = colours * (per_pixel / (pixels.pitch * length))
-        count = min(length, 2 * math.ceil(float((own.half / spacing).max())) + _ROOM)
-        known = _known(fitted, group, own, spacing * (count / 2), offsets[group])
-        phases = known[0] * (2 * math.pi / colours)[:, None, None]
-        matrix = _from_chebyshev(fitted.degree, count)[1].to(spacing.device)
-        points, low = math.ceil(per_pixel * margin), matrix.to(pixels.dtype)
-        weight = spacing**2 / relative_to[group]
-        for part in torch.arange(len(group)).split(max(1, _AT_ONCE // length**2)):
-            phase = (matrix @ phases[part] @ matrix.mT).remainder_(2 * math.pi).to(pixels.dtype)
-            passed = opening(low @ known[1][part].to(pixels.dtype) @ low.mT)
-            field = phasor(phase) * passed
-            image = squared(_middle(_middle(field, length, points).mT, length, points).mT)
-            if not pixels.integrate:
-                image = _every(image, int(per_pixel))
-            light = Pixels(pixels.shape, per_pixel, integrate=pixels.integrate).of_image(image)
-            factor = weight[part] * (spacing[part] * pixels.pitch / colours[part]) ** 2
-            if whole:
-                factor = weight[part] * passed.sum((-2, -1)) / light.sum((-2, -1))
-            found.append(light * factor[:, None, None].to(pixels.dtype))
+        spacing = shortest * per_pixel / (pixels.pitch * length)
+        for part in torch.tensor(indices).split(max(1, _AT_ONCE // length**2)):
+            own = frame[part]
+            count = min(length, 2 * math.ceil(float(own.half.max()) / spacing) + _ROOM)
+            path, clearances = _known(fitted, nodes[part], own, spacing * (count / 2), offsets[part])
+            matrix = _from_chebyshev(fitted.degree, count)[1].to(path.device)
+            low = matrix.to(pixels.dtype)
+            openings = Openings(edge_distance(low @ clearances[:, colours].to(pixels.dtype) @ low.mT))
+            lights = []
+            for index, wavelength in enumerate(wavelengths.tolist()):
+                phase = (matrix @ (path[:, index] * (2 * math.pi / wavelength)) @ matrix.mT).remainder_(2 * math.pi)
+                passed = openings.at(weights[index])
+                field = phasor(phase.to(pixels.dtype)) * passed
+                points_per_pixel = per_pixel * shortest / wavelength
+                points = math.ceil(points_per_pixel * margin)
+                image = squared(_middle(_middle(field, length, points).mT, length, points).mT)
+                if not pixels.integrate:
+                    image = _every(image, int(per_pixel))
+                light = Pixels(pixels.shape, points_per_pixel, integrate=pixels.integrate).of_image(image)
+                factor = spacing**2 / relative_to[part, index]
+                if whole:
+                    factor = factor * passed.sum((-2, -1)) / light.sum((-2, -1))
+                else:
+                    factor = factor * (spacing * pixels.pitch / wavelength) ** 2
+                lights.append(light * factor[:, None, None].to(pixels.dtype))
+            found.append(torch.stack(lights, dim=1))
         order += indices
     return torch.cat(found)[torch.tensor(order).argsort()]
 
