@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from kcam.optics.regions import pixel_positions
 from kcam.optics.rendering.borders import extend
+from kcam.optics.rendering.places import Bank, Between, grid
 from kcam.optics.rendering.resampling import Resampling, resampling
 from kcam.optics.rendering.zones import Axis, blend
 from kcam.optics.source import FieldPSFs, PixelGrid
 
 ALLOWED = 1.5e-3
 """Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]."""
+BETWEEN = 0.7  # of that, what PSFs between those that are computed may leave, at most
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
 _PROBE = 128  # pixels between the places that are tried
@@ -37,14 +39,15 @@ sums over the layers."""
 class FieldEstimate:
     """What a picture over the field is off by, of its light (rms); print it.
 
-    places: PSFs computed for it, rows x columns; apart: pixels between them. blending: by PSFs between the places;
-    pupils: by polynomials between the heights that were traced; colours: by PSFs between wavelengths; sampling: of
-    pupils; outside: light beyond the window.
+    places: PSFs computed for it, rows x columns. apart: pixels between nodes, of which each has a PSF. blending: by
+    these between the nodes; between: by cubics between the places; pupils: by polynomials between the heights that were
+    traced; colours: by PSFs between wavelengths; sampling: of pupils; outside: light beyond the window.
     """
 
     places: tuple[int, int]
     apart: int
     blending: float
+    between: float
     pupils: float
     colours: float
     sampling: float
@@ -53,11 +56,12 @@ class FieldEstimate:
     @property
     def total(self) -> float:
         """Their sum."""
-        return self.blending + self.pupils + self.colours + self.sampling + self.outside
+        return self.blending + self.between + self.pupils + self.colours + self.sampling + self.outside
 
     def __str__(self) -> str:
         rows = (
-            (f"between {self.places[0]} x {self.places[1]} places, {self.apart} pixels apart", self.blending),
+            (f"between nodes, {self.apart} pixels apart", self.blending),
+            (f"between {self.places[0]} x {self.places[1]} places", self.between),
             ("between traced heights", self.pupils),
             ("between wavelengths", self.colours),
             ("pupil sampling", self.sampling),
@@ -68,12 +72,25 @@ class FieldEstimate:
 
 
 @dataclass(frozen=True)
+class _How:
+    """Pixels between nodes, and the error that this leaves; pixels between PSFs that are computed, where that is not
+    done at each node, and the error that this leaves.
+    """
+
+    apart: int
+    blending: float = 0.0
+    known: float | None = None
+    between: float = 0.0
+
+
+@dataclass(frozen=True)
 class FieldPicture:
     """How a picture over the field is made.
 
     psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. render: of one
     zone. border: see `Imaging`. spacing: pixels between nodes, or None. whole:
-    the light outside the window is put back into it. mixing: weights (M, L) of what the picture adds up.
+    the light outside the window is put back into it. mixing: weights (M, L) of what the picture adds up; mixed: render
+    takes these sums. most: bytes of PSFs that are held.
     """
 
     psfs: FieldPSFs
@@ -84,18 +101,16 @@ class FieldPicture:
     spacing: int | None = None
     whole: bool = True
     mixing: Tensor | None = None
+    mixed: bool = False
+    most: float = math.inf
 
     def light(self, planes: Tensor, shares: Tensor | None) -> Tensor:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
         planes, shares = self.moved(planes, shares)
+        how = self.how(planes, shares)
+        between = self.bank if how.known is None else self.between(planes, apart=how.known)
         return blend(
-            planes,
-            shares,
-            self.bank,
-            self.render,
-            window=self.pixels.shape,
-            apart=self.apart(planes, shares)[0] if self.spacing is None else self.spacing,
-            border=self.border,
+            planes, shares, between, self.render, window=self.pixels.shape, apart=how.apart, border=self.border
         )
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -119,22 +134,25 @@ class FieldPicture:
     def bank(self, places: Tensor) -> Tensor:
         """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
         on_sensor = self._on_sensor(places)
-        psfs = self.psfs.bank(on_sensor, self.pixels, whole=self.whole, mixing=self.mixing)
+        psfs = self.psfs.bank(on_sensor, self.pixels, whole=self.whole, mixing=self.mixing, mixed=self.mixed)
         return psfs / self.psfs.illumination(on_sensor).to(psfs).view(-1, 1, 1, 1, 1)
 
     def explain(self, planes: Tensor, shares: Tensor | None) -> FieldEstimate:
         """What `light` will do, and what it is off by."""
         with torch.no_grad():
             planes, shares = self.moved(planes, shares)
-            picture = (planes.shape[-2], planes.shape[-1])
-            if self.spacing is None:
-                apart, error = self.apart(planes, shares)
+            picture, how = (planes.shape[-2], planes.shape[-1]), self.how(planes, shares)
+            if self.spacing is not None:
+                how = replace(
+                    how, blending=self._left(planes, shares, [self._blended(self.bank, picture, how.apart)])[0]
+                )
+            if how.known is None:
+                sides = zip(picture, self.pixels.shape, strict=True)
+                rows, columns = (len(Axis.of(n, m, apart=how.apart).nodes) for n, m in sides)
             else:
-                apart, error = self.spacing, self.blending_error(planes, shares, self.spacing)
-            rows, columns = (
-                len(Axis.of(n, m, apart=apart).nodes) for n, m in zip(picture, self.pixels.shape, strict=True)
-            )
-            return FieldEstimate((rows, columns), apart, error, **self.psfs.deviations(self.pixels, mixing=self.mixing))
+                rows, columns = (len(grid(n, apart=how.known)) for n in picture)
+            deviations = self.psfs.deviations(self.pixels, mixing=self.mixing)
+            return FieldEstimate((rows, columns), how.apart, how.blending, how.between, **deviations)
 
     @property
     def _centre(self) -> Tensor:
@@ -143,20 +161,63 @@ class FieldPicture:
     def _on_sensor(self, places: Tensor) -> Tensor:
         return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
 
-    @torch.no_grad()
-    def apart(self, planes: Tensor, shares: Tensor | None, *, allowed: float = ALLOWED) -> tuple[int, float]:
-        """How many pixels nodes may lie apart for an error, and what error that leaves: planes as they were moved."""
-        sides = (planes.shape[-2], planes.shape[-1])
-        probe = max(2, min(_PROBE, max(sides) // 2))
-        error = self.blending_error(planes, shares, probe)
-        steps = [2**k for k in range(int(math.log2(_FINEST)), int(math.log2(_COARSEST)) + 1)]
-        fine = [step for step in steps if error * (step / probe) ** 2 <= allowed] or [_FINEST]
-        return fine[-1], error * (fine[-1] / probe) ** 2
+    def between(self, planes: Tensor, *, apart: float) -> Between:
+        """PSFs of all places, from those of some."""
+        return Between.known(self.bank, (planes.shape[-2], planes.shape[-1]), apart=apart)
 
     @torch.no_grad()
-    def blending_error(self, planes: Tensor, shares: Tensor | None, apart: int) -> float:
-        """Of the light between nodes so far apart, rms, relative: in the worst of some cells, on the patches of the
-        picture with most detail, for all of its detail.
+    def how(self, planes: Tensor, shares: Tensor | None) -> _How:
+        """How densely PSFs are computed, and nodes lie, for `ALLOWED`: planes as they were moved."""
+        if self.spacing is not None:
+            return _How(self.spacing)
+        sides = (planes.shape[-2], planes.shape[-1])
+        probe = max(2, min(_PROBE, max(sides) // 2))
+        known, apart, error = 2.0 * probe, _FINEST, math.inf
+        while known > apart:
+            if self._held(sides, known) > self.most:
+                break
+            between = self.between(planes, apart=known)
+            off, error = self._left(
+                planes, shares, [self._interpolated(between, sides), self._blended(between, sides, probe)]
+            )
+            apart, error = _apart(error, probe, allowed=ALLOWED - min(off, BETWEEN * ALLOWED))
+            if off <= BETWEEN * ALLOWED:
+                return _How(apart, error, known, off)
+            known /= 2
+        apart, error = _apart(self._left(planes, shares, [self._blended(self.bank, sides, probe)])[0], probe)
+        return _How(apart, error)
+
+    def _held(self, sides: tuple[int, int], known: float) -> float:
+        """Bytes of the PSFs that are known."""
+        places = math.prod(len(grid(n, apart=known)) for n in sides)
+        psf = self.bank(torch.zeros(1, 2, dtype=torch.float64))
+        return float(places * psf.nbytes)
+
+    def _blended(self, bank: Bank, sides: tuple[int, int], apart: float) -> Bank:
+        """What windows between nodes so far apart are off by, in the middle of a cell at parts (1, 2) of a quadrant."""
+        corners = torch.cartesian_prod(*[torch.tensor([-apart / 2, apart / 2], dtype=torch.float64)] * 2)
+        last = _last(sides)
+
+        def off(cell: Tensor) -> Tensor:
+            middle = cell * (last - apart / 2).clamp(min=0)
+            psfs = bank(torch.cat([middle, torch.maximum(torch.minimum(middle + corners, last), -last)]))
+            return psfs[:1] - psfs[1:].mean(0, keepdim=True)
+
+        return off
+
+    def _interpolated(self, between: Between, sides: tuple[int, int]) -> Bank:
+        """What PSFs between those that are known are off by, in the middle of a cell at parts (1, 2) of a quadrant."""
+
+        def off(cell: Tensor) -> Tensor:
+            middle = between.middle(cell * _last(sides))
+            return self.bank(middle) - between(middle)
+
+        return off
+
+    @torch.no_grad()
+    def _left(self, planes: Tensor, shares: Tensor | None, deviations: list[Bank]) -> list[float]:
+        """Of the light where PSFs deviate so from what they should be, rms, relative: in the worst of some cells, on
+        the patches of the picture with most detail, for all of its detail.
         """
         height, width = planes.shape[-2:]
         detail = _detail(planes)
@@ -170,23 +231,35 @@ class FieldPicture:
                 for k, m in zip((row, column), self.pixels.shape, strict=True)
             ]
             patches.append([None if part is None else part[..., places[0], places[1]] for part in (extended, around)])
-        corners = torch.cartesian_prod(*[torch.tensor([-apart / 2, apart / 2], dtype=torch.float64)] * 2)
-        last = torch.tensor([width - 1, height - 1], dtype=torch.float64) / 2
-        worst, uneven, (before, left) = 0.0, 0.0, (m // 2 for m in self.pixels.shape)
-        for x, y in _CELLS:
-            middle = torch.tensor([[x, y]], dtype=torch.float64) * (last - apart / 2).clamp(min=0)
-            psfs = self.bank(torch.cat([middle, torch.maximum(torch.minimum(middle + corners, last), -last)]))
-            off, squares = psfs[0] - psfs[1:].mean(0), 0.0
-            uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
-            for own, part in patches:
-                found = self.render(off, own, part, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
-                squares += float(found.double().square().sum())
-            worst = max(worst, squares)
+        cells = [torch.tensor([cell], dtype=torch.float64) for cell in _CELLS]
         weight = float(detail.sum() / detail.flatten()[most].sum().clamp(min=1e-300))
         step = max(1, math.isqrt(height * width // _SAMPLED))
-        point = planes.new_ones(1, psfs.shape[2], 1, 1)
+        point = self.bank(torch.zeros(1, 2, dtype=torch.float64))[0].sum((-2, -1), keepdim=True)[:1]
         light = self.render(point, planes[..., ::step, ::step].contiguous(), None).double().square().sum() * step**2
-        return math.sqrt(worst * weight / max(float(light), 1e-300) + uneven**2)
+        before, left = (m // 2 for m in self.pixels.shape)
+        found = []
+        for deviation in deviations:
+            worst = uneven = 0.0
+            for cell in cells:
+                off, squares = deviation(cell)[0], 0.0
+                uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
+                for own, part in patches:
+                    seen = self.render(off, own, part, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
+                    squares += float(seen.double().square().sum())
+                worst = max(worst, squares)
+            found.append(math.sqrt(worst * weight / max(float(light), 1e-300) + uneven**2))
+        return found
+
+
+def _last(sides: tuple[int, int]) -> Tensor:
+    return torch.tensor([sides[1] - 1, sides[0] - 1], dtype=torch.float64) / 2
+
+
+def _apart(error: float, probe: float, *, allowed: float = ALLOWED) -> tuple[int, float]:
+    """How many pixels nodes may lie apart, and the error that this leaves, from that of nodes `probe` apart."""
+    steps = [2**k for k in range(int(math.log2(_FINEST)), int(math.log2(_COARSEST)) + 1)]
+    fine = [step for step in steps if error * (step / probe) ** 2 <= allowed] or [_FINEST]
+    return fine[-1], error * (fine[-1] / probe) ** 2
 
 
 def _detail(planes: Tensor) -> Tensor:

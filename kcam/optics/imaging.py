@@ -446,10 +446,19 @@ class Imaging(Stage):
         picture = (scene.shape[-2], scene.shape[-1])
         spectra = None if scene.spectra is None else scene.spectra.to(like)
         rendering = self._rendering(scene) | {"border": "zero", "cache": None, "weights": weights, "spectra": spectra}
-        mixing = None
+        mixing, mixed = None, False
         if weights is not None:
-            shape = Renderer(like.new_empty(1, len(self._psf_wavelengths(scene.wavelengths)), 1, 1), **rendering)
-            mixing = shape.mixing().detach().flatten(0, 1)
+            groups = len(self._psf_wavelengths(scene.wavelengths))
+            sums = Renderer(like.new_empty(1, groups, 1, 1), **rendering).mixing()
+            channels, count = sums.shape[:2]
+            mixing = sums.flatten(0, 1)
+            mixed = len(vergences) == 1 and len(mixing) < groups  # of layers the PSFs themselves tell what they hide
+            if mixed:  # each sum is a band of its own, of one plane and for one channel
+                of_plane, of_channel = (
+                    torch.eye(count).repeat(1, channels),
+                    torch.eye(channels).repeat_interleave(count, 1),
+                )
+                rendering |= {"spectra": of_plane.to(like), "weights": of_channel.to(like), "owner": None}
         psfs = self._over_field(picture, vergences, scene.wavelengths)
 
         def render(bank: Tensor, planes: Tensor, shares: Tensor | None, *, occlusion: bool | None = None) -> Tensor:
@@ -460,7 +469,8 @@ class Imaging(Stage):
 
         pixels, spacing = self.pixels(window, like), self.accuracy.spacing
         whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
-        return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole, mixing)
+        most = self.accuracy.max_memory / 4
+        return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole, mixing, mixed, most)
 
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
         """What a picture over the field will be off by; as it is with `forward`'s arguments. Raises: ValueError for

@@ -126,12 +126,20 @@ class PSFSource(Photometric, Protocol):
 class FieldPSFs(Protocol):
     """PSFs over the sensor, of points at some vergences (Z,) and wavelengths (L,)."""
 
-    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False, mixing: Tensor | None = None) -> Tensor:
+    def bank(
+        self,
+        places: Tensor,
+        pixels: PixelGrid,
+        *,
+        whole: bool = False,
+        mixing: Tensor | None = None,
+        mixed: bool = False,
+    ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what the chief ray of the focus brings to places (F, 2) [m], as light falls; relative
         to the light of a point on the axis. The window's middle is that place.
 
         whole: light outside is put back. mixing: weights (M, L) of what the picture adds up, from which follows how
-        closely wavelengths are to be told apart; None: each is seen.
+        closely wavelengths are to be told apart; None: each is seen. mixed: these sums instead, (F, Z, M, h, w).
         """
 
     def window(self, pixels: PixelGrid) -> tuple[int, int]:

@@ -70,29 +70,41 @@ class FieldPSFs:
         """Of the object points whose images lie so far from the axis (F,), and of that on it: (F + 1,)."""
         return torch.cat([radii * self.image_heights.over_radius.at(radii**2), radii.new_zeros(1)])
 
-    def bank(self, places: Tensor, pixels: PixelGrid, *, whole: bool = False, mixing: Tensor | None = None) -> Tensor:
+    def bank(
+        self,
+        places: Tensor,
+        pixels: PixelGrid,
+        *,
+        whole: bool = False,
+        mixing: Tensor | None = None,
+        mixed: bool = False,
+    ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
-        of a point on the axis. whole, mixing: see `source.FieldPSFs`.
+        of a point on the axis. whole, mixing, mixed: see `source.FieldPSFs`.
 
         Places that mirror each other share their PSF; of many wavelengths the PSFs' pixels are polynomials through
         those of a few (`colours`). Without gradients they are kept for another picture, up to `KEPT` bytes.
         """
-        key = (pixels, whole, _bytes(mixing), _bytes(places))
+        key = (pixels, whole, mixed, _bytes(mixing), _bytes(places))
         if key in self.kept_banks:
             return self.kept_banks[key]
-        found = self._mirrored(places, pixels, whole=whole, mixing=mixing).to(pixels.device)
+        found = self._mirrored(places, pixels, whole=whole, mixing=mixing, mixed=mixed).to(pixels.device)
         held = sum(bank.nbytes for bank in self.kept_banks.values())
         if not found.requires_grad and held + found.nbytes <= KEPT:
             self.kept_banks[key] = found
         return found
 
-    def _mirrored(self, places: Tensor, pixels: PixelGrid, *, whole: bool, mixing: Tensor | None) -> Tensor:
+    def _mirrored(
+        self, places: Tensor, pixels: PixelGrid, *, whole: bool, mixing: Tensor | None, mixed: bool
+    ) -> Tensor:
         height, width = pixels.shape
         odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
         own, which = (places.abs() / (1e-6 * pixels.pitch)).round().unique(dim=0, return_inverse=True)
         nodes, shares, _ = self.colours(pixels, mixing)
         psfs = self._bank(own * (1e-6 * pixels.pitch), nodes, odd, whole=whole)
-        if len(nodes) < len(self.wavelengths):
+        if mixed and mixing is not None:
+            shares = mixing.to(shares) @ shares
+        if mixed or len(nodes) < len(self.wavelengths):
             psfs = torch.einsum("ln,fznhw->fzlhw", shares.to(psfs), psfs)
         mirrored = [
             psf.flip([axis for axis, side in ((-1, x), (-2, y)) if side < 0])
