@@ -132,6 +132,25 @@ def chebyshev_between(low: Tensor, high: Tensor, count: int) -> Tensor:
     return (low + high) / 2 + (high - low) / 2 * chebyshev_points(count).to(low.device)
 
 
+def lagrange_weights(nodes: Tensor, at: Tensor) -> Tensor:
+    """Weights (N, n) of the polynomial through values at nodes (n,); one each where all of `at` (N,) are nodes."""
+    if len(nodes) == 1:
+        return at.new_ones(len(at), 1, dtype=torch.float64)
+    equal = (nodes.detach() - at.detach()[:, None]).abs() <= 1e-12 * nodes.detach().abs().max()
+    if bool(equal.any(1).all()):
+        return equal.double()
+    scale = 4 / float((nodes.detach().max() - nodes.detach().min()).clamp(min=1e-300))
+    return lagrange_products(nodes.detach() * scale, at * scale)
+
+
+def lagrange_products(nodes: Tensor, at: Tensor) -> Tensor:
+    """The same without a scale: nodes and values near 1 in size."""
+    off = (at[:, None] - nodes)[:, None, :].expand(-1, len(nodes), -1)
+    own = torch.eye(len(nodes), dtype=torch.bool, device=nodes.device)
+    apart = torch.where(own, 1.0, nodes[:, None] - nodes)
+    return (torch.where(own, 1.0, off) / apart).prod(-1)
+
+
 MOST_NODES = 512  # nodes that one Gauss-Legendre rule has at most: they are eigenvalues, at the cost of n^3
 
 

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from kcam.optics.numerics import chebyshev, chebyshev_points
-from kcam.optics.pupil.rim import edge_profile
 
 DEGREES = (12, 16, 20)
 """Of the polynomials, even in dx: 49, 81 or 121 terms. The first whose residual is small enough is taken."""
@@ -143,14 +142,3 @@ def fit(
         if float(residual.max()) <= enough:
             break
     return fitted
-
-
-def opening(clearances: Tensor) -> Tensor:
-    """Quadrature weights of what passes at the points of grids, (N, S, A, B) -> (N, A, B): 1 inside, 0 outside, and
-    low-passed between.
-
-    An edge is straight as far as the low-pass reaches, some samples; 1 - sqrt(1 - q) is nearly the distance from it.
-    """
-    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=0)))
-    slope = functools.reduce(torch.add, (part.square() for part in torch.gradient(depth, dim=(-2, -1))))
-    return functools.reduce(torch.mul, edge_profile(depth * slope.clamp(min=1e-18).rsqrt()).unbind(1))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcam.optics.compound.images import Frame, areas
 from kcam.optics.compound.pupil import PupilFit, odd_terms
-from kcam.optics.numerics import chebyshev_between, chebyshev_points
+from kcam.optics.numerics import chebyshev_between, chebyshev_points, lagrange_products, lagrange_weights
 
 Fitted = Callable[[Tensor, Tensor, Tensor], PupilFit]
 """Pupils of F x Z x L nodes: heights (F,), vergences (Z,), wavelengths (L,)."""
@@ -148,30 +148,12 @@ def difference(first: PupilFit, second: PupilFit, wavelengths: Tensor) -> Tensor
     return phase + (two / one - 1).abs()
 
 
-def lagrange_weights(nodes: Tensor, at: Tensor) -> Tensor:
-    """Weights (N, n) of the polynomial through values at nodes (n,); one each where all of `at` (N,) are nodes."""
-    if len(nodes) == 1:
-        return at.new_ones(len(at), 1, dtype=torch.float64)
-    equal = (nodes.detach() - at.detach()[:, None]).abs() <= 1e-12 * nodes.detach().abs().max()
-    if bool(equal.any(1).all()):
-        return equal.double()
-    scale = 4 / float((nodes.detach().max() - nodes.detach().min()).clamp(min=1e-300))
-    return _products(nodes.detach() * scale, at * scale)
-
-
-def _products(nodes: Tensor, at: Tensor) -> Tensor:
-    off = (at[:, None] - nodes)[:, None, :].expand(-1, len(nodes), -1)
-    own = torch.eye(len(nodes), dtype=torch.bool, device=nodes.device)
-    apart = torch.where(own, 1.0, nodes[:, None] - nodes)
-    return (torch.where(own, 1.0, off) / apart).prod(-1)
-
-
 def _parities(nodes: Tensor, at: Tensor, highest: float) -> tuple[Tensor, Tensor]:
     """Weights for what is even and what is odd in the height: nodes stand on both sides of the axis."""
     if len(nodes) == 1:
         one = at.new_ones(len(at), 1, dtype=torch.float64)
         return one, one
-    both = _products(2 / highest * torch.cat([nodes, -nodes]), 2 / highest * at)
+    both = lagrange_products(2 / highest * torch.cat([nodes, -nodes]), 2 / highest * at)
     right, left = both.split(len(nodes), dim=1)
     return right + left, right - left
 

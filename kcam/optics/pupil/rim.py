@@ -119,3 +119,14 @@ def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing
     for radius, weight in discs:
         quadrant = quadrant + weight * disc_weights(count, spacing=spacing, radius=radius)
     return quadrant
+
+
+def opening(clearances: Tensor) -> Tensor:
+    """Quadrature weights of what passes at the points of grids, (N, S, A, B) -> (N, A, B): 1 inside, 0 outside, and
+    low-passed between.
+
+    An edge is straight as far as the low-pass reaches, some samples; 1 - sqrt(1 - q) is nearly the distance from it.
+    """
+    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=0)))
+    slope = functools.reduce(torch.add, (part.square() for part in torch.gradient(depth, dim=(-2, -1))))
+    return functools.reduce(torch.mul, edge_profile(depth * slope.clamp(min=1e-18).rsqrt()).unbind(1))
