@@ -27,7 +27,7 @@ from kcam.optics.propagation.grid import matrix_cost
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import PRODUCTS, Propagator
 from kcam.optics.propagation.transforms import PlainLayout
-from kcam.optics.pupil.coordinates import Pupil, grid_nodes, grid_spacing
+from kcam.optics.pupil.coordinates import EDGE_MARGIN, Pupil, grid_nodes, grid_spacing
 from kcam.optics.pupil.rim import opening
 from kcam.optics.pupil.warp import Interpolation
 from kcam.optics.source import Points
@@ -37,8 +37,9 @@ _OUTLINE = 65  # points of each side of the pupil's outline
 _FARTHEST = 2.0  # semi-apertures: nodes beyond stay here, where nothing is open
 _UNBENT = 0.01  # of the finest detail: a kernel less bent is straight
 _STEPS = 3
+_MARGIN = 16  # points beyond the window
 ERROR = 1e-4  # of a PSF's light (L1), from what more samples give; measured
-_AREA_SAMPLES = 96
+_AREA_SAMPLES = 192
 
 
 def off_axis_psf(query: Query) -> Tensor:
@@ -202,14 +203,27 @@ class Seen:
         """How much farther off the axis a slope of the path sends light: 1 / cos^3."""
         return float((1 + (self.place.detach() / self.query.sensor_distance.detach()).square().sum()) ** 1.5)
 
-    def counts(self, vergences: Tensor) -> list[tuple[int, int]]:
-        """Columns and rows for each wavelength. Raises: ValueError for too many, or for a number given too small."""
+    def evaluation(self, wavelength: float) -> tuple[float, int]:
+        """(points per pixel, pixels from the middle to the edge of what is evaluated): as many points beyond the window
+        as a pixel's sinc filter finds its light at.
+        """
+        per_pixel, margin = self.query.evaluation_grid(wavelength)[0], 0
+        if self.query.grid.integrate:
+            margin = min(max(2, math.ceil(_MARGIN / per_pixel)), sampling.WINDOW_MARGIN)
+        return per_pixel, max(self.query.shape) // 2 + margin
+
+    def counts(self, vergences: Tensor) -> list[tuple[int, int, int]]:
+        """Columns and rows for each wavelength, and samples across the true plane where maps of pixels are low-passed.
+
+        Raises: ValueError for too many, or for a number given too small.
+        """
         query, found = self.query, []
         for wavelength, far in zip(query.wavelengths.tolist(), self.displacements(vergences).tolist(), strict=True):
             needed, enough = [], True
             for half, displacement in zip(self.frame[1].tolist(), far, strict=True):
                 geometry = {"semi_aperture": half, "sensor_distance": 1.0, "wavelength": wavelength}
-                geometry |= {"half_window": query.half_window, "displacement": displacement}
+                half_window = self.evaluation(wavelength)[1] * query.pixel_pitch
+                geometry |= {"half_window": half_window, "displacement": displacement}
                 needed.append(sampling.pupil_samples(**geometry, kappa=query.how.kappa))
                 enough &= query.how.samples is None or sampling.kappa_of(query.how.samples, **geometry) > 1
             if not enough:
@@ -220,12 +234,34 @@ class Seen:
             if query.how.samples is None and max(needed) > sampling.MAX_PUPIL_SAMPLES:
                 raise ValueError(
                     f"this PSF needs {max(needed)} pupil samples at {wavelength * 1e9:.4g} nm (blur "
-                    f"{max(far) * 1e3:.3g} mm, window {2 * query.half_window * 1e3:.3g} mm), more than the limit of "
+                    f"{max(far) * 1e3:.3g} mm, window {max(query.shape) * query.pixel_pitch * 1e3:.3g} mm), more than the limit of "
                     f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape or field, or a distance nearer to the focus."
                 )
             given = query.how.samples and query.how.samples + query.how.samples % 2
-            found.append((given, given) if given else (_in_steps(needed[0]), _in_steps(needed[1])))
+            found.append(self._with_maps(*((given, given) if given else (_in_steps(n) for n in needed))))
         return found
+
+    def _with_maps(self, *counts: int) -> tuple[int, int, int]:
+        """The grid is everywhere at least as fine as the true plane's, whose samples hold all that the grid must."""
+        if not self.query.lens.has_pixels:
+            return counts[0], counts[1], 0
+        with torch.no_grad():
+            grid = self.grid((_LOOK, _LOOK))
+            inside = torch.maximum(grid.x.abs(), grid.y.abs()) <= 1
+            sx, sy, far = (part[inside] for part in self.cosines(grid.x, grid.y))
+            away, cross = far / self.query.semi_aperture, (sx * sy).abs()
+            ends = [((1 - part**2 + cross) / away, (1 - part**2 - cross) / away) for part in (sx, sy)]
+            margin = 2 * EDGE_MARGIN
+            true = [
+                (count - margin) * float(steep.max() / half)
+                for count, (steep, _), half in zip(counts, ends, self.frame[1], strict=True)
+            ]
+            across = 32 * math.ceil((max(true) + margin) / 32)
+            fine = [
+                margin + 2 * math.ceil((across - margin) * float(half / flat.min()) / 2)
+                for (_, flat), half in zip(ends, self.frame[1], strict=True)
+            ]
+        return fine[0], fine[1], across
 
     # ---- light -----------------------------------------------------------------------------------------------------
 
@@ -243,9 +279,11 @@ class Seen:
         """Where how much light passes: x, y in semi-apertures, and its share times the area there."""
         if cells is None:
             return grid.x, grid.y, self.opened(grid) * grid.area
-        edges = cells.edges.to(grid.x)
-        centres, sides = (edges[1:] + edges[:-1]) / 2, edges.diff()
-        return centres[None, :], centres[:, None], cells.power.double() * (sides[:, None] * sides)
+        parts = math.ceil(_AREA_SAMPLES / len(cells.power))
+        sides = cells.edges.to(grid.x).diff().repeat_interleave(parts) / parts
+        centres = sides.cumsum(0) - sides / 2 - 1
+        power = cells.power.double().repeat_interleave(parts, 0).repeat_interleave(parts, 1)
+        return centres[None, :], centres[:, None], power * (sides[:, None] * sides)
 
     def illumination(self) -> Tensor:
         """Of the place, over that of the axis."""
@@ -269,23 +307,25 @@ class Seen:
     def psfs(self, vergences: Tensor) -> Tensor:
         """(Z, L, H, W)."""
         query = self.query
-        alike: dict[tuple[int, int], list[int]] = defaultdict(list)
+        alike: dict[tuple[int, int, int], list[int]] = defaultdict(list)
         for index, counts in enumerate(self.counts(vergences)):
             alike[counts].append(index)
         found: list[Tensor] = [torch.empty(0)] * len(query.wavelengths)
         for counts, members in alike.items():
             wavelengths = query.wavelengths[members]
-            per_pixel, reach = query.evaluation_grid(float(wavelengths.min()))
-            images = self._group(wavelengths.to(query.device), vergences, self.grid(counts), per_pixel, reach)
+            per_pixel, half = self.evaluation(float(wavelengths.min()))
+            reach = math.ceil(per_pixel * half)
+            images = self._group(wavelengths.to(query.device), vergences, counts, per_pixel, reach)
             for index, image in zip(members, images, strict=True):
                 found[index] = image
         return torch.stack(found, dim=1)
 
-    def _group(self, wavelengths: Tensor, vergences: Tensor, grid: Grid, per_pixel: float, reach: int) -> list[Tensor]:
-        query = self.query
+    def _group(
+        self, wavelengths: Tensor, vergences: Tensor, counts: tuple[int, int, int], per_pixel: float, reach: int
+    ) -> list[Tensor]:
+        query, grid, count = self.query, self.grid(counts[:2]), counts[2]
         a, d, dtype = query.semi_aperture, query.sensor_distance, query.dtype
-        count = self._true_count(grid, wavelengths)
-        cells = Cells.of(query, wavelengths, count=count, spacing=grid_spacing(count))
+        cells = Cells.of(query, wavelengths, count=count, spacing=grid_spacing(count or _LOOK))
         light = self.passed(grid, cells)
         share = self._illumination(*light)
         energy = (light[2] * self._falloff2(light[0], light[1], vergences)).sum((-2, -1)) * a**2  # (Z,)
@@ -354,18 +394,6 @@ class Seen:
         return Bend(before, across, down, density.to(query.dtype))
 
     # ---- maps of pixels ---------------------------------------------------------------------------------------------
-
-    def _true_count(self, grid: Grid, wavelengths: Tensor) -> int:
-        """Samples across the true plane that hold what the grid holds, where its direction cosines change fastest."""
-        with torch.no_grad():
-            inside = torch.maximum(grid.x.abs(), grid.y.abs()) <= 1
-            sx, sy, far = (part[inside] for part in self.cosines(grid.x, grid.y))
-            steepest = torch.maximum(1 - sx**2 + (sx * sy).abs(), 1 - sy**2 + (sx * sy).abs()) / far
-            a = float(self.query.semi_aperture)
-            density = max(
-                (len(part) - 24) / (2 * float(half)) for part, half in zip(grid.sines, self.frame[1], strict=True)
-            )
-            return 32 * math.ceil((2 * a * float(steepest.max()) * density + 24) / 32)
 
     def _onto(self, field: Tensor, grid: Grid, count: int) -> Tensor:
         """Fields (..., N, N) in the true plane on the grid, (..., ny, nx): along x at true y, then along y."""
