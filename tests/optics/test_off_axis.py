@@ -34,11 +34,15 @@ def seen(lens: optics.Lens, field: list[list[float]], *, distance: float = 1.0, 
 def summed(
     lens: optics.Lens, point: list[float], *, pitch: float, shape: tuple[int, int], distance: float = 1.0, nodes: int
 ) -> Tensor:
-    """Rayleigh-Sommerfeld by midpoints of a polar grid; every path is a square root of its own."""
+    """Rayleigh-Sommerfeld by midpoints of a polar or square grid; every path is a square root of its own."""
     a, d, k = float(lens.aperture.semi_aperture()), float(lens.sensor_distance), 2 * math.pi / float(LINE)
-    rho = ((torch.arange(nodes, dtype=DOUBLE) + 0.5) / nodes).sqrt()  # rings of one area
-    angle = torch.arange(2 * nodes, dtype=DOUBLE) * (math.pi / nodes)
-    x, y = (rho[:, None] * angle.cos()).flatten(), (rho[:, None] * angle.sin()).flatten()
+    if lens.round:
+        rho = ((torch.arange(nodes, dtype=DOUBLE) + 0.5) / nodes).sqrt()  # rings of one area
+        angle = torch.arange(2 * nodes, dtype=DOUBLE) * (math.pi / nodes)
+        x, y = (rho[:, None] * angle.cos()).flatten(), (rho[:, None] * angle.sin()).flatten()
+    else:  # by pixels, each of many nodes
+        side = (torch.arange(nodes, dtype=DOUBLE) + 0.5) * (2 / nodes) - 1
+        x, y = side.repeat(nodes), side.repeat_interleave(nodes)
     one = torch.ones((), dtype=DOUBLE)
     pupil = Pupil(x, y, one * a, one * d, paraxial=False, round=True)
     opd = torch.zeros_like(x)
@@ -47,7 +51,7 @@ def summed(
         for coefficient, term in element.terms(pupil, LINE):
             opd = opd + coefficient[0] * term
         pixels = element.pixel_map(LINE)
-        if pixels is not None:
+        if pixels is not None and pixels.factors is not None:
             n = len(pixels.values)
             row, column = (((part + 1) / 2 * n).floor().long().clamp(0, n - 1) for part in (y, x))
             opd = opd + pixels.factors[0] * pixels.values[row, column] / k
@@ -63,31 +67,33 @@ def summed(
             phase = k * (there + opd + far)
             wave = light * d / far**2
             found[i, j] = (wave * phase.cos()).sum() ** 2 + (wave * phase.sin()).sum() ** 2
-    area = math.pi * a**2 / len(x)
+    area = (math.pi if lens.round else 4) * a**2 / len(x)
     here = torch.sqrt((x0 - a * x) ** 2 + (y0 - a * y) ** 2 + d**2)
     share = (here**-4).sum() / ((d**2 + a**2 * pupil.rho2) ** -2).sum()
     return found * area * pitch**2 / float(LINE) ** 2 / light.square().sum() * share
 
 
+ROUND = optics.CircularAperture(0.5 * mm)
 SQUARES = torch.arange(64, dtype=DOUBLE).view(8, 8) * 2.3 % 6.0
 
 
 @pytest.mark.parametrize(
-    ("elements", "point", "nodes", "limit"),
+    ("aperture", "elements", "point", "nodes", "limit"),
     [
-        ([], [0.0, 0.1], 200, 1e-3),
-        ([], [0.2, 0.1], 300, 4e-3),
-        ([optics.ZernikeAberration(ZERNIKES)], [-0.1, 0.1], 200, 2e-3),
-        ([optics.PlanoConvexLens(60 * mm)], [0.0, 0.15], 300, 2e-3),
-        ([optics.DOE(SQUARES)], [0.05, 0.1], 500, 1.5e-2),
+        (ROUND, [], [0.0, 0.1], 200, 3e-4),
+        (ROUND, [], [0.2, 0.1], 300, 8e-4),
+        (ROUND, [optics.ZernikeAberration(ZERNIKES)], [-0.1, 0.1], 200, 6e-4),
+        (ROUND, [optics.PlanoConvexLens(60 * mm)], [0.0, 0.15], 300, 6e-4),
+        (optics.SquareAperture(0.5 * mm), [optics.DOE(SQUARES / 3)], [0.05, 0.1], 320, 2e-3),
     ],
     ids=["near", "far", "zernike", "singlet", "doe"],
 )
-def test_a_psf_is_the_sum_over_the_pupil_with_exact_distances(elements, point, nodes: int, limit: float) -> None:
-    lens = lens_of(*elements)
+def test_a_psf_is_the_sum_over_the_pupil_with_exact_distances(
+    aperture, elements, point, nodes: int, limit: float
+) -> None:
+    lens = optics.Lens(aperture, optics.ThinLens(8 * mm), *elements, focus_distance=1.0)
     own = seen(lens, [point], shape=(11, 11), integrate=False)[0]
     truth = summed(lens, point, pitch=3 * um, shape=(11, 11), nodes=nodes)
-    print(float((own - truth).abs().sum() / truth.sum()), float(own.sum()), float(truth.sum()))
     assert float((own - truth).abs().sum() / truth.sum()) < limit
 
 
@@ -135,10 +141,11 @@ def test_light_is_the_pupil_in_direction_cosines(aperture: optics.Element) -> No
     expected = torch.stack(shares) / shares[0]
     found = lens.relative_illumination(field)
     assert float((found / expected - 1).abs().max()) < 3e-4
+    assert float(lens.relative_illumination(torch.zeros(1, 2))) == 1
     cos4 = (1 + field.square().sum(1)) ** -2
     assert float((found / cos4 - 1).abs().max()) < 0.05
-    wide = seen(lens, [[0.3, 0.1]], pixel_pitch=30 * um, shape=(21, 21), dtype=torch.float32)
-    assert float(wide.sum()) == pytest.approx(float(expected[1]), rel=0.02)
+    wide = seen(lens, [[0.3, 0.1]], pixel_pitch=20 * um, shape=(17, 17), dtype=torch.float32)
+    assert float(wide.sum()) == pytest.approx(float(expected[1]), rel=0.03)
 
 
 def test_chief_rays_go_straight_and_light_lands_around_them() -> None:
@@ -180,8 +187,8 @@ def test_it_is_the_compound_lens_that_is_as_thin() -> None:
     field = torch.tensor([[0.0, 0.1]], dtype=DOUBLE)
     arguments = {"distances": 1.0, "pixel_pitch": 10 * um, "shape": (41, 41), "dtype": DOUBLE, "field": field}
     one, other = (lens.psf(LINE, **arguments)[0, 0, 0] for lens in (thin, compound))
-    print(float((one - other).abs().sum()), float(one.sum()), float(other.sum()))
-    assert float((one - other).abs().sum()) < 0.05
+    # the compound lens weighs a point's light by its own rays, which field curvature lets converge elsewhere
+    assert float((one / one.sum() - other / other.sum()).abs().sum()) < 0.02
     landed = compound.image_point(LINE, distances=1.0, field=field)
     assert float((landed - thin.image_point(LINE, distances=1.0, field=field)).abs().max()) < 2 * um
 
@@ -214,7 +221,6 @@ def test_gradients_are_those_of_differences(what: str) -> None:
     step = 1e-5
     with torch.no_grad():
         slope = (loss(start + step * direction) - loss(start - step * direction)) / (2 * step)
-    print(float((gradient * direction).sum()), float(slope))
     assert float((gradient * direction).sum()) == pytest.approx(float(slope), rel=2e-3)
 
 
@@ -241,7 +247,6 @@ def test_an_even_scene_gives_relative_illumination() -> None:
     y, x = torch.meshgrid(torch.tensor([0, 8, 16, 32]), torch.tensor([0, 16, 24, 48]), indexing="ij")
     field = torch.stack([x - 24, y - 16], -1).view(-1, 2) * (24 * um / float(lens.sensor_distance))
     expected = lens.relative_illumination(field).view(4, 4)
-    print((light[y, x] / expected - 1))
     assert float((light[y, x] / expected - 1).abs().max()) < 2e-3
 
 
@@ -253,23 +258,22 @@ def test_a_small_picture_about_the_axis_is_that_of_one_psf() -> None:
     )
     assert varied.varies
     assert not alone.varies
-    print(float((varied(scene_of(light)) - alone(scene_of(light))).abs().max()))
     assert float((varied(scene_of(light)) - alone(scene_of(light))).abs().max()) < 1e-3
 
 
 @pytest.mark.slow
 def test_a_picture_is_that_of_one_psf_for_each_pixel() -> None:
     """60 dB, and an estimate of at least a third of the error."""
-    lens = lens_of(optics.ZernikeAberration(ZERNIKES), width=1 * mm, focal_length=4 * mm)
-    light, window = Draw(1).noise(1, 1, 20, 26).double() ** 2, (11, 11)
-    imaging = optics.Imaging(lens, pixel_pitch=30 * um, field=True, border="zero", psf_shape=window)
-    psfs = imaging._over_field((20, 26), torch.ones(1, dtype=DOUBLE), LINE)
-    y, x = torch.meshgrid(torch.arange(20) - 9.5, torch.arange(26) - 12.5, indexing="ij")
-    places = -torch.stack([x, y], -1).view(-1, 2).double() * 30 * um
-    bank = psfs.bank(places, imaging.pixels(window, light))[:, 0, 0].flip(-2, -1).view(20, 26, *window)
-    truth = torch.zeros(30, 36, dtype=DOUBLE)
-    for row in range(20):
-        for column in range(26):
+    lens = lens_of(optics.ZernikeAberration(ZERNIKES), width=0.3 * mm, focal_length=3 * mm)
+    light, window = Draw(1).noise(1, 1, 12, 16).double() ** 2, (11, 11)
+    imaging = optics.Imaging(lens, pixel_pitch=40 * um, field=True, border="zero", psf_shape=window)
+    psfs = imaging._over_field((12, 16), torch.ones(1, dtype=DOUBLE), LINE)
+    y, x = torch.meshgrid(torch.arange(12) - 5.5, torch.arange(16) - 7.5, indexing="ij")
+    places = -torch.stack([x, y], -1).view(-1, 2).double() * 40 * um
+    bank = psfs.bank(places, imaging.pixels(window, light))[:, 0, 0].flip(-2, -1).view(12, 16, *window)
+    truth = torch.zeros(22, 26, dtype=DOUBLE)
+    for row in range(12):
+        for column in range(16):
             truth[row : row + 11, column : column + 11] += bank[row, column] * light[0, 0, row, column]
     truth = truth[5:-5, 5:-5]
     off = float((imaging(scene_of(light))[0, 0] - truth).square().mean().sqrt())
