@@ -106,7 +106,7 @@ class Lens(ElementStack):
             dtype: of the result, float32 or float64.
             field: (F, 2) of object points, X / D and Y / D; None: the axis. Elements are then thin screens in one
                 plane, with the phase that they have on the axis, and paths to and from them are exact: coma,
-                astigmatism, field curvature and vignetting by cos^4 come of themselves.
+                astigmatism, field curvature (3 : 1, without the 1 / n that glass adds) and cos^4 come of themselves.
         Returns:   (Z, L, H, W), >= 0 up to the sampling error; sums to the share of light in the window. With field
                    (F, Z, L, H, W), relative to the light of a point on the axis: sums to the relative illumination,
                    less what leaves the window, in whose centre is the image of the chief ray, `image_point`.

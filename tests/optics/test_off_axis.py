@@ -175,7 +175,9 @@ def test_astigmatism_of_a_thin_lens() -> None:
 
 
 def test_it_is_the_compound_lens_that_is_as_thin() -> None:
-    """A plano-convex lens 1 um thick, its stop at the glass: the bending and the thickness are what differs."""
+    """A plano-convex lens 5 um thick, its stop at the glass: what glass adds to a screen, Petzval's t^2 / 2 n f, is small
+    where the field is.
+    """
     radius = 20 * mm
     thin = optics.Lens(optics.CircularAperture(0.5 * mm), optics.PlanoConvexLens(radius), focus_distance=1.0)
     distance = float(thin.sensor_distance)
@@ -184,11 +186,11 @@ def test_it_is_the_compound_lens_that_is_as_thin() -> None:
         optics.Surface(radius=math.inf, thickness=0.0, glass=None),
         sensor_distance=distance,
     )
-    field = torch.tensor([[0.0, 0.1]], dtype=DOUBLE)
+    field = torch.tensor([[0.0, 0.05]], dtype=DOUBLE)
     arguments = {"distances": 1.0, "pixel_pitch": 10 * um, "shape": (41, 41), "dtype": DOUBLE, "field": field}
     one, other = (lens.psf(LINE, **arguments)[0, 0, 0] for lens in (thin, compound))
     # the compound lens weighs a point's light by its own rays, which field curvature lets converge elsewhere
-    assert float((one / one.sum() - other / other.sum()).abs().sum()) < 0.02
+    assert float((one / one.sum() - other / other.sum()).abs().sum()) < 0.012
     landed = compound.image_point(LINE, distances=1.0, field=field)
     assert float((landed - thin.image_point(LINE, distances=1.0, field=field)).abs().max()) < 2 * um
 

@@ -232,10 +232,11 @@ class Seen:
                     f"would enter the window. Use samples >= {max(needed)}, or leave samples out."
                 )
             if query.how.samples is None and max(needed) > sampling.MAX_PUPIL_SAMPLES:
+                window = max(query.shape) * query.pixel_pitch
                 raise ValueError(
                     f"this PSF needs {max(needed)} pupil samples at {wavelength * 1e9:.4g} nm (blur "
-                    f"{max(far) * 1e3:.3g} mm, window {max(query.shape) * query.pixel_pitch * 1e3:.3g} mm), more than the "
-                    f"limit of {sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape or field, or a distance nearer to the focus."
+                    f"{max(far) * 1e3:.3g} mm, window {window * 1e3:.3g} mm), more than the limit of "
+                    f"{sampling.MAX_PUPIL_SAMPLES}. Use a smaller shape or field, or a distance nearer to the focus."
                 )
             given = query.how.samples and query.how.samples + query.how.samples % 2
             found.append(self._with_maps(*((given, given) if given else (_in_steps(n) for n in needed))))
