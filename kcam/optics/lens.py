@@ -117,7 +117,7 @@ class Lens(ElementStack):
         Warns:     UserWarning for an f-number outside `TESTED_F_NUMBERS`.
         Valid for thin elements and scalar light; `explain` estimates the error on the axis. Off it the kernel is off by
         a phase of about pi a^2 r^2 / (lambda d^3) a distance r from the centre: 1e-3 of the light in windows of 0.3 mm
-        at 50 mm f/12 or of 0.1 mm at 8 mm f/8, 1e-2 where r is 45 um at 4 mm f/2.
+        at 50 mm f/12 or of 0.2 mm at 8 mm f/8, up to 12 degrees; 1e-2 where r is 45 um at 4 mm f/2.
         """
         query = self.query(
             wavelengths,

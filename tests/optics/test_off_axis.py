@@ -175,8 +175,8 @@ def test_astigmatism_of_a_thin_lens() -> None:
 
 
 def test_it_is_the_compound_lens_that_is_as_thin() -> None:
-    """A plano-convex lens 5 um thick, its stop at the glass: what glass adds to a screen, Petzval's t^2 / 2 n f, is small
-    where the field is.
+    """A plano-convex lens 5 um thick, its stop at the glass: what glass adds to a screen, Petzval's t^2 / 2 n f, is
+    small where the field is.
     """
     radius = 20 * mm
     thin = optics.Lens(optics.CircularAperture(0.5 * mm), optics.PlanoConvexLens(radius), focus_distance=1.0)
