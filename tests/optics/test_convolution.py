@@ -160,7 +160,7 @@ def test_kappa_sets_the_pupil_sampling() -> None:
         ({"tile": 0}, "tile must be a positive number of pixels, or None, got 0"),
         ({"rank": 0}, "rank must be a positive number of factors, or None, got 0"),
         ({"kappa": 1.0}, "kappa must be above 1 sample per fringe, got 1. Its default is 2.7"),
-        ({"precision": "half"}, 'precision must be "float32", "float64" or None for the scene\'s, got \'half\''),
+        ({"precision": "half"}, "precision must be \"float32\", \"float64\" or None for the scene's, got 'half'"),
     ],
 )
 def test_bad_shortcuts_say_what_is_wrong(arguments: dict, text: str) -> None:
