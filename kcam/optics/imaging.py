@@ -63,7 +63,7 @@ class Imaging(Stage):
         border: what lies beyond the picture: reflect, replicate, periodic or zero.
         distance: of a plain tensor [m]; None: where the lens is focused.
         field: whether the PSF varies over the picture, with distortion, lateral colour and vignetting; None: with a
-            `CompoundLens`. False: every pixel sees the PSF of the axis.
+            `CompoundLens`, but not with a `Lens`. False: every pixel sees the PSF of the axis.
         centre: of the picture, x and y on the sensor from the axis [m], as light falls: a sensor that is cropped or
             shifted; None: on the axis.
         accuracy: what is computed and what is left out, an `Accuracy`; shortcuts: its arguments one by one, over those.
@@ -139,7 +139,7 @@ class Imaging(Stage):
 
     def _check_recipe(self) -> None:
         """What asks for a method that does not exist, or for one where nothing is computed, is refused at once."""
-        if isinstance(self.lens, Lens):
+        if isinstance(self.lens, Lens) and not self.field:
             pixels = self.pixels(self.accuracy.psf_shape or (1, 1), torch.empty(0))
             query = self.lens.question(Points(torch.zeros(1)), wavelength_grid([550e-9]), pixels, self.accuracy)
             if self.accuracy.method is not None:
@@ -147,6 +147,10 @@ class Imaging(Stage):
             return
         own = ((field.name, getattr(self.accuracy, field.name) != field.default) for field in fields(Recipe))
         given = ", ".join(f"{name}=" for name, changed in own if changed)
+        if given and self.field:
+            raise ValueError(
+                f"{given} says how PSFs of the axis are computed; over the field there is one way. Leave it out."
+            )
         if given:
             raise ValueError(
                 f"{given} says how a Lens computes its PSFs; a {type(self.lens).__name__} has them. Leave it out."
@@ -372,7 +376,7 @@ class Imaging(Stage):
         if self.accuracy.blur:
             at_once = min(layers, self._layers_at_once(bands, window, planes))
             operations |= {"bank": float(math.ceil(layers / at_once)), "psf": float(layers * groups)}
-            if isinstance(self.lens, Lens):
+            if isinstance(self.lens, Lens) and not self.varies:
                 pixels = self.pixels(window, planes)
                 operations |= self.lens.operations(Points(vergences), grouped, pixels, self.accuracy)
             bank = float(2 * at_once * groups * window[0] * window[1] * itemsize)
@@ -424,7 +428,9 @@ class Imaging(Stage):
     @property
     def varies(self) -> bool:
         """Whether the PSF varies over the picture."""
-        return isinstance(self.lens, FieldSource) and self.field is not False and self.accuracy.blur
+        if not isinstance(self.lens, FieldSource) or not self.accuracy.blur:
+            return False
+        return self.lens.varies if self.field is None else self.field
 
     @property
     def _middle(self) -> tuple[float, float]:

@@ -140,11 +140,11 @@ def lagrange_weights(nodes: Tensor, at: Tensor) -> Tensor:
     if bool(equal.any(1).all()):
         return equal.double()
     scale = 4 / float((nodes.detach().max() - nodes.detach().min()).clamp(min=1e-300))
-    return polynomial_weights(nodes.detach() * scale, at * scale)
+    return lagrange_products(nodes.detach() * scale, at * scale)
 
 
-def polynomial_weights(nodes: Tensor, at: Tensor) -> Tensor:
-    """The same for nodes whose products neither vanish nor overflow: about 4 from first to last."""
+def lagrange_products(nodes: Tensor, at: Tensor) -> Tensor:
+    """The same without a scale: nodes and values near 1 in size."""
     off = (at[:, None] - nodes)[:, None, :].expand(-1, len(nodes), -1)
     own = torch.eye(len(nodes), dtype=torch.bool, device=nodes.device)
     apart = torch.where(own, 1.0, nodes[:, None] - nodes)

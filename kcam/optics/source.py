@@ -157,7 +157,12 @@ class FieldPSFs(Protocol):
 
 @runtime_checkable
 class FieldSource(PSFSource, Protocol):
-    """Optics whose PSF varies over the sensor, computed for any place."""
+    """Optics whose PSF varies over the sensor, computed for any place.
+
+    varies: whether a picture does so unless `Imaging` is told.
+    """
+
+    varies: bool
 
     def over_field(self, reach: float, vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """For places up to `reach` from the axis [m], points at vergences (Z,) [1/m], wavelengths (L,) [m]."""

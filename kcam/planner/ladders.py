@@ -136,7 +136,7 @@ class _View:
             pixels = imaging.pixels(self.window, planes)
             query = lens.question(Points(ends), scene.wavelengths, pixels, imaging.accuracy)
             self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
-            self.row = imaging.accuracy.row(query)
+            self.row = None if imaging.varies else imaging.accuracy.row(query)
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.beside = self.few()
 
@@ -164,7 +164,7 @@ def _blur(view: _View) -> Iterator[Ladder]:
 def _model(view: _View) -> Iterator[Ladder]:
     """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
     lens, propagator = view.imaging.lens, view.imaging.accuracy.propagator
-    if propagator != "nonparaxial" or not isinstance(lens, Lens) or not lens.has_pixels:
+    if view.row is None or propagator != "nonparaxial" or not isinstance(lens, Lens) or not lens.has_pixels:
         return
     levels = [Level("fresnel", {"propagator": "fresnel"}), Level("nonparaxial", {})]
     yield Ladder("model", levels, view.beside)

@@ -182,6 +182,8 @@ def called(row: Propagator) -> str:
 
 def query_of(imaging: Imaging, scene: Scene) -> Query:
     """What a bank of PSFs of this scene asks for: at its nearest and its farthest point."""
+    if imaging.varies:
+        raise ValueError("kcam tradeoff takes a camera that sees one PSF in all its pixels: Imaging(..., field=False).")
     vergences = ends_of(scene)
     window = imaging.psf_window(scene.wavelengths, vergences=vergences, picture=scene.shape[1:])
     lens, pixels = imaging.computed_lens(by="kcam tradeoff"), imaging.pixels(window, scene.coefficients)

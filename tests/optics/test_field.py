@@ -283,7 +283,8 @@ def test_what_cannot_be_is_a_clear_error() -> None:
     with pytest.raises(ValueError, match="centre must be x and y"):
         optics.Imaging(small(), centre=(5.0, 2.0))
     thin = optics.Lens(optics.CircularAperture(3 * mm), optics.ThinLens(20 * mm), focus_distance=1.0)
+    measured = optics.MeasuredPSF(torch.ones(1, 1, 3, 3), wavelengths=LINES[:1], distances=1.0, pixel_pitch=4 * um)
     with pytest.raises(ValueError, match="one PSF, that on the axis"):
-        optics.Imaging(thin, field=True)
+        optics.Imaging(measured, field=True)
     with pytest.raises(ValueError, match="sees one PSF"):
         optics.Imaging(thin).explain(scene_of(torch.ones(1, 1, 8, 8)))

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from kcam.inputs import as_values
 from kcam.optics.compound.images import Frame
-from kcam.optics.compound.pupil import OVERFILL, PupilFit, opening
+from kcam.optics.compound.pupil import OVERFILL, PupilFit
 from kcam.optics.compound.tracing import Rays
 from kcam.optics.numerics import fast_length, phasor, squared
 from kcam.optics.propagation import sampling
+from kcam.optics.pupil.rim import opening
 
 SPECTRAL_LINES = (486.1e-9, 546.1e-9, 656.3e-9)
 """F, e and C [m]: the colours in which a lens is looked at unless others are named."""

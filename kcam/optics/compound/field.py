@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from kcam.optics.banks import Banks, window_side
 from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
 from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, axis_light, images
 from kcam.optics.compound.pupil import PupilFit
 from kcam.optics.compound.table import PupilTable
-from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.optics.source import PixelGrid
 
 _LOOKED = 9  # heights at which a window is asked for
-_COLOURS = (5, 7, 10, 14, 20)  # wavelengths at which PSFs are computed
-COLOUR_ERROR = 1e-2
-OUTSIDE = 5e-3
-"""Share of the light that the default window may leave out; it is put back into the window, see `Imaging`."""
-_HALVINGS = 30
-KEPT = 2e8  # bytes of PSFs that are kept
 
 
 def bank(
@@ -58,9 +52,6 @@ class FieldPSFs:
     wavelengths: Tensor
     reach: float  # of places, from the axis [m]
 
-    kept: dict[tuple[object, ...], tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
-    kept_banks: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
-
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
         grid = torch.meshgrid(self._heights(radii), self.vergences, wavelengths, indexing="ij")
@@ -80,39 +71,15 @@ class FieldPSFs:
         mixed: bool = False,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
-        of a point on the axis. whole, mixing, mixed: see `source.FieldPSFs`.
-
-        Places that mirror each other share their PSF; of many wavelengths the PSFs' pixels are polynomials through
-        those of a few (`colours`). Without gradients they are kept for another picture, up to `KEPT` bytes.
+        of a point on the axis: see `banks.Banks`.
         """
-        key = (pixels, whole, mixed, _bytes(mixing), _bytes(places))
-        if key in self.kept_banks:
-            return self.kept_banks[key]
-        found = self._mirrored(places, pixels, whole=whole, mixing=mixing, mixed=mixed).to(pixels.device)
-        held = sum(bank.nbytes for bank in self.kept_banks.values())
-        if not found.requires_grad and held + found.nbytes <= KEPT:
-            self.kept_banks[key] = found
-        return found
+        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, mixed=mixed)
 
-    def _mirrored(
-        self, places: Tensor, pixels: PixelGrid, *, whole: bool, mixing: Tensor | None, mixed: bool
-    ) -> Tensor:
-        height, width = pixels.shape
-        odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
-        own, which = (places.abs() / (1e-6 * pixels.pitch)).round().unique(dim=0, return_inverse=True)
-        nodes, shares, _ = self.colours(pixels, mixing)
-        psfs = self._bank(own * (1e-6 * pixels.pitch), nodes, odd, whole=whole)
-        if mixed and mixing is not None:
-            shares = mixing.to(shares) @ shares
-        if mixed or len(nodes) < len(self.wavelengths):
-            psfs = torch.einsum("ln,fznhw->fzlhw", shares.to(psfs), psfs)
-        mirrored = [
-            psf.flip([axis for axis, side in ((-1, x), (-2, y)) if side < 0])
-            for psf, (x, y) in zip(psfs[which], places.tolist(), strict=True)
-        ]
-        return torch.stack(mirrored)[..., :height, :width]
+    @functools.cached_property
+    def _banks(self) -> Banks:
+        return Banks(self._bank, self.wavelengths, self.reach)
 
-    def _bank(self, places: Tensor, wavelengths: Tensor, pixels: PixelGrid, *, whole: bool = False) -> Tensor:
+    def _bank(self, places: Tensor, wavelengths: Tensor, pixels: PixelGrid, whole: bool) -> Tensor:
         radii = places.norm(dim=1)
         away = radii.clamp(min=1e-150)[:, None]
         towards = torch.where(radii[:, None] > 0, places / away, places.new_tensor([0.0, 1.0]))
@@ -121,35 +88,6 @@ class FieldPSFs:
         # what is above the axis falls below it: heights of chief rays count along the object's direction
         moved = chief + radii[:, None, None]
         return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
-
-    def colours(self, pixels: PixelGrid, mixing: Tensor | None = None) -> tuple[Tensor, Tensor, float]:
-        """Wavelengths (n,) at which PSFs are computed, and what each gives to those that are asked for, (L, n): as few
-        as leave `COLOUR_ERROR` of the light in what the picture adds up of them; and what these leave.
-        """
-        key = (pixels, _bytes(mixing))
-        if key not in self.kept:
-            self.kept[key] = self._few(pixels, mixing)
-        return self.kept[key]
-
-    @torch.no_grad()
-    def _few(self, pixels: PixelGrid, mixing: Tensor | None) -> tuple[Tensor, Tensor, float]:
-        every = torch.eye(len(self.wavelengths), dtype=torch.float64)
-        if len(self.wavelengths) <= _COLOURS[0]:
-            return self.wavelengths, every, 0.0
-        places = torch.tensor([[0.0, 0.0], [0.42, 0.56]], dtype=torch.float64) * self.reach
-        mixing = every if mixing is None else mixing.double().cpu()
-        mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
-        truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), self._bank(places, self.wavelengths, pixels))
-        for n in _COLOURS:
-            if n >= len(self.wavelengths):
-                break
-            nodes = chebyshev_between(*self.wavelengths.aminmax(), n)
-            shares = lagrange_weights(nodes, self.wavelengths)
-            found = torch.einsum("mn,fznhw->fzmhw", (mixing @ shares).to(truth), self._bank(places, nodes, pixels))
-            off = float((found - truth).abs().sum((-2, -1)).max())
-            if off < COLOUR_ERROR:
-                return nodes, shares, off
-        return self.wavelengths, every, 0.0
 
     @torch.no_grad()
     def deviations(self, pixels: PixelGrid, *, mixing: Tensor | None = None) -> dict[str, float]:
@@ -166,7 +104,7 @@ class FieldPSFs:
         )
         return {
             "pupils": pupils,
-            "colours": self.colours(pixels, mixing)[2],
+            "colours": self._banks.colours(pixels, mixing)[2],
             "sampling": QUICK_ERROR,
             "outside": float(lost.max().clamp(min=0)),
         }
@@ -208,13 +146,7 @@ class FieldPSFs:
         colours = self.wavelengths.repeat(len(slopes) // len(self.wavelengths))
         # the rim of an area is that of a disc at least: 2 sqrt(pi area)
         tail = (colours * (math.pi / area).sqrt() / math.pi**2)[:, None]
-        low, high = slopes.new_zeros(len(slopes), 1), slopes.amax(1, keepdim=True) + tail / OUTSIDE
-        for _ in range(_HALVINGS):
-            radius = (low + high) / 2
-            left = (radius - slopes).clamp(min=1e-12)
-            beyond = (tail / left).clamp(max=1).mean(1, keepdim=True)
-            low, high = torch.where(beyond > OUTSIDE, radius, low), torch.where(beyond > OUTSIDE, high, radius)
-        side = 2 * math.ceil(float(high.max()) / pixels.pitch) + 1
+        side = window_side(slopes, tail, pitch=pixels.pitch)
         return side, side
 
     def _spread(self) -> tuple[Tensor, Tensor]:
@@ -224,7 +156,3 @@ class FieldPSFs:
         frame = Frame.upright(fitted)
         own = torch.cat([radii, radii.new_zeros(1)]).repeat_interleave(len(self.vergences) * len(self.wavelengths))
         return frame.slopes + (fitted.chief + own).abs()[:, None], areas(fitted, frame)
-
-
-def _bytes(values: Tensor | None) -> bytes | None:
-    return None if values is None else values.detach().cpu().numpy().tobytes()

@@ -19,10 +19,11 @@ import torch
 from scipy.interpolate import BarycentricInterpolator
 from torch import Tensor
 
-from kcam.optics.compound.pupil import Openings, PupilFit, edge_distance, opening
+from kcam.optics.compound.pupil import PupilFit
 from kcam.optics.numerics import fast_length, lagrange_weights, phasor, squared
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.pixels import Pixels
+from kcam.optics.pupil.rim import Openings, edge_distance, opening
 from kcam.optics.source import PixelGrid
 
 _SHARES = 100  # of the light, of which it is known how far they fall

@@ -66,6 +66,7 @@ class CompoundLens(nn.Module):
 
     surfaces: Sequence[Surface]
     sensor_distance: Scalar
+    varies = True
 
     def __init__(
         self,

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from kcam.optics.numerics import chebyshev, chebyshev_points
-from kcam.optics.pupil.rim import edge_profile
 
 DEGREES = (12, 16, 20)
 """Of the polynomials, even in dx: 49, 81 or 121 terms. The first whose residual is small enough is taken."""
@@ -25,7 +24,6 @@ _FEWEST = 12  # rays that pass
 _LESS = 12.0  # exponent of the weight for a clearance below 0
 _FAR = -0.3  # clearance of rays that are left out: they may come from anywhere, and widen what is fitted
 OVERFILL = 1.12  # of the stop's radius, to which rays are sent: seen from off the axis the stop is no ellipse
-_NEAR = 7.0  # samples from an edge, within which it is felt, and one more
 _RINGS, _SPOKES = 21, 49
 
 
@@ -144,38 +142,3 @@ def fit(
         if float(residual.max()) <= enough:
             break
     return fitted
-
-
-def opening(clearances: Tensor) -> Tensor:
-    """Quadrature weights of what passes at the points of grids, (N, S, A, B) -> (N, A, B): 1 inside, 0 outside, and
-    low-passed between.
-    """
-    return functools.reduce(torch.mul, edge_profile(edge_distance(clearances)).unbind(1))
-
-
-def edge_distance(clearances: Tensor) -> Tensor:
-    """How far inside an edge points of grids lie, right near the edge, [samples], (..., A, B).
-
-    An edge is straight as far as the low-pass reaches, some samples; 1 - sqrt(1 - q) is nearly the distance from it.
-    """
-    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=0)))
-    slope = functools.reduce(torch.add, (part.square() for part in torch.gradient(depth, dim=(-2, -1))))
-    return depth * slope.clamp(min=1e-18).rsqrt()
-
-
-class Openings:
-    """What passes at the points of grids at many wavelengths, from distances at a few, (N, E, S, A, B)."""
-
-    def __init__(self, distances: Tensor) -> None:
-        with torch.no_grad():
-            self._open = (distances[:, 0] > 0).all(1).to(distances.dtype)
-            lowest, highest = distances.amin(1), distances.amax(1)
-            near = ((lowest < _NEAR) & (highest > -_NEAR)).any(1)
-            self._near = near.flatten().nonzero()[:, 0]
-        self._distances = distances.permute(1, 0, 3, 4, 2).flatten(1, 3)[:, self._near]
-
-    def at(self, weights: Tensor) -> Tensor:
-        """Quadrature weights as of `opening`, (N, A, B), where each of the few counts so much, (E,)."""
-        distances = torch.tensordot(weights.to(self._distances), self._distances, dims=1)
-        passed = edge_profile(distances).prod(-1)
-        return self._open.flatten().index_put((self._near,), passed).view(self._open.shape)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcam.optics.compound.images import Frame, areas
 from kcam.optics.compound.pupil import PupilFit, odd_terms
-from kcam.optics.numerics import chebyshev_between, chebyshev_points, lagrange_weights, polynomial_weights
+from kcam.optics.numerics import chebyshev_between, chebyshev_points, lagrange_products, lagrange_weights
 
 Fitted = Callable[[Tensor, Tensor, Tensor], PupilFit]
 """Pupils of F x Z x L nodes: heights (F,), vergences (Z,), wavelengths (L,)."""
@@ -153,7 +153,7 @@ def _parities(nodes: Tensor, at: Tensor, highest: float) -> tuple[Tensor, Tensor
     if len(nodes) == 1:
         one = at.new_ones(len(at), 1, dtype=torch.float64)
         return one, one
-    both = polynomial_weights(2 / highest * torch.cat([nodes, -nodes]), 2 / highest * at)
+    both = lagrange_products(2 / highest * torch.cat([nodes, -nodes]), 2 / highest * at)
     right, left = both.split(len(nodes), dim=1)
     return right + left, right - left
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcam.optics.autograd import once_differentiable
 from kcam.optics.numerics import Pair, sines
 from kcam.optics.propagation.question import Query
-from kcam.optics.propagation.transforms import Transform
+from kcam.optics.propagation.transforms import PlainLayout, Transform
 from kcam.optics.pupil.banded import MapWeights
 from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.maps import PixelMap, pixel_weights
@@ -81,7 +81,7 @@ class Cells:
         dispersed = torch.stack(factors).to(query.dtype)
         return Cells(torch.as_tensor(edges), amplitude, power, torch.stack(phases), dispersed, weights)
 
-    def field(self, warp: Warp | None, layout: Transform) -> Tensor:
+    def field(self, warp: Warp | None, layout: Transform | PlainLayout) -> Tensor:
         """Transmission and phase on the true plane's grid, or on to the image-side plane's by `warp`.
 
         Real and imaginary part, (2, L, ...) in a transform's layout.

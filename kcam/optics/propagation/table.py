@@ -8,6 +8,7 @@ there.
 from __future__ import annotations
 
 from kcam.optics.propagation.grid import CHIRP_Z, FFT, MATRIX
+from kcam.optics.propagation.off_axis import OFF_AXIS
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.propagation.rays import RAYS
@@ -26,8 +27,14 @@ def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method
 
     With `samples` given, the cheapest that has a grid of so many.
 
+    Points off the axis have one row.
+
     Raises: ValueError for an unknown propagator or method, listing the known ones.
     """
+    if query.points.positions is not None:
+        if propagator != OFF_AXIS.physics or method is not None:
+            raise ValueError("off the axis PSFs are computed in one way: leave out propagator= and method=.")
+        return OFF_AXIS
     if isinstance(propagator, Propagator):
         return propagator
     if propagator not in PHYSICS:

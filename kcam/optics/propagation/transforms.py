@@ -136,7 +136,7 @@ def _part(quadrants: Sequence[Tensor], out: Sequence[Tensor]) -> None:
 
 
 @dataclass(frozen=True)
-class _PlainLayout:
+class PlainLayout:
     """Layout of the transforms that work on the whole grid."""
 
     def arrange(self, maps: Tensor) -> Tensor:
@@ -152,7 +152,7 @@ class _PlainLayout:
 
 
 @dataclass(frozen=True)
-class ChirpZTransform(_PlainLayout):
+class ChirpZTransform(PlainLayout):
     """Bluestein's chirp-z transform on both axes: exact like the matrix form, O(L^2 log L).
 
     m j = (m^2 + j^2 - (m - j)^2) / 2 turns the sum into a convolution of length L >= N + M - 1.
@@ -198,7 +198,7 @@ class ChirpZTransform(_PlainLayout):
 
 
 @dataclass(frozen=True)
-class FFTTransform(_PlainLayout):
+class FFTTransform(PlainLayout):
     """One padded FFT, as equation (3.4) has it, on a pupil grid scaled so that its bins fall exactly on the points.
 
     Valid for nodes with scale * step * spacing = 2 pi / length.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 _EDGE_HALF_WIDTH = 6  # samples; half width of the low-pass for edge weights
 _PROFILE_STEPS = 256
+_NEAR = _EDGE_HALF_WIDTH + 1.0  # samples from an edge within which it is felt, and one more
 FINE = 5  # cells per sample in which the area of the rim is measured exactly
 _NODES_AT_ONCE = 32  # rows of edge weights; more take more memory than the cells that they share take time
 
@@ -119,3 +120,39 @@ def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing
     for radius, weight in discs:
         quadrant = quadrant + weight * disc_weights(count, spacing=spacing, radius=radius)
     return quadrant
+
+
+def opening(clearances: Tensor) -> Tensor:
+    """Quadrature weights of what passes at the points of grids, (N, S, A, B) -> (N, A, B): 1 inside, 0 outside, and
+    low-passed between.
+    """
+    return functools.reduce(torch.mul, edge_profile(edge_distance(clearances)).unbind(1))
+
+
+def edge_distance(clearances: Tensor) -> Tensor:
+    """How far inside an edge points of grids lie, right near the edge, [samples], (..., A, B).
+
+    An edge is straight as far as the low-pass reaches, some samples; 1 - sqrt(1 - q) is nearly the distance from it.
+    """
+    # in float32 q may be 1 at the middle, and the slope of a root of 0, which is infinite, times no light is NaN
+    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=1e-12)))
+    slope = functools.reduce(torch.add, (part.square() for part in torch.gradient(depth, dim=(-2, -1))))
+    return depth * slope.clamp(min=1e-18).rsqrt()
+
+
+class Openings:
+    """What passes at the points of grids at many wavelengths, from distances at a few, (N, E, S, A, B)."""
+
+    def __init__(self, distances: Tensor) -> None:
+        with torch.no_grad():
+            self._open = (distances[:, 0] > 0).all(1).to(distances.dtype)
+            lowest, highest = distances.amin(1), distances.amax(1)
+            near = ((lowest < _NEAR) & (highest > -_NEAR)).any(1)
+            self._near = near.flatten().nonzero()[:, 0]
+        self._distances = distances.permute(1, 0, 3, 4, 2).flatten(1, 3)[:, self._near]
+
+    def at(self, weights: Tensor) -> Tensor:
+        """Quadrature weights as of `opening`, (N, A, B), where each of the few counts so much, (E,)."""
+        distances = torch.tensordot(weights.to(self._distances), self._distances, dims=1)
+        passed = edge_profile(distances).prod(-1)
+        return self._open.flatten().index_put((self._near,), passed).view(self._open.shape)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcam.optics.numerics import lagrange
 from kcam.optics.pupil.banded import pieces
 from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.rim import kaiser_sinc
@@ -116,3 +117,54 @@ def _series(limit: float) -> tuple[Tensor, int]:
     fitted = np.polynomial.chebyshev.chebfit(nodes, values.T, _MOST_TERMS - 1)
     kept = np.nonzero(np.abs(fitted).max(1) > _SMALLEST)[0]
     return torch.as_tensor(fitted[: max(int(kept[-1]) + 1, 2)]), reach
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """Values along rows (..., R, N), 0 beyond them, at positions of each row (R, n).
+
+    first: of the neighbours of each position, (R, n). weights: of these, (taps, R, n). length: N.
+    """
+
+    first: Tensor
+    weights: Tensor
+    length: int
+
+    @staticmethod
+    def by_sinc(positions: Tensor, length: int, *, dtype: torch.dtype) -> Interpolation:
+        """As a `Warp`, of any displacement; positions in samples, 0 of the first."""
+        low, offset = _split(positions, dtype)
+        taps = torch.arange(1 - _HALF_WIDTH, _HALF_WIDTH + 1, device=positions.device)[:, None, None]
+        inside = (1 - ((offset - taps) / _HALF_WIDTH) ** 2).clamp(min=0)
+        weights = torch.sinc(offset - taps) * torch.special.i0(_BETA * inside.sqrt()) / float(np.i0(_BETA))
+        return Interpolation(low + int(taps[0]), weights, length)
+
+    @staticmethod
+    def by_polynomial(positions: Tensor, length: int, *, dtype: torch.dtype) -> Interpolation:
+        """Through the eight nearest: for what is sampled a little finer than it must be; differentiable."""
+        low, offset = _split(positions, dtype)
+        taps = range(-3, 5)
+        return Interpolation(low + taps[0], torch.stack(lagrange(offset, taps=taps)), length)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """(..., R, N) -> (..., R, n)."""
+        rows = torch.nn.functional.pad(rows, (1, 1))
+        found = rows.new_zeros(*rows.shape[:-1], self.first.shape[-1])
+        for tap, weight in enumerate(self.weights):
+            found = torch.addcmul(found, rows.gather(-1, self._index(tap, found)), weight)
+        return found
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Transpose of `forward`."""
+        rows = values.new_zeros(*values.shape[:-1], self.length + 2)
+        for tap, weight in enumerate(self.weights):
+            rows.scatter_add_(-1, self._index(tap, values), values * weight)
+        return rows[..., 1:-1]
+
+    def _index(self, tap: int, like: Tensor) -> Tensor:
+        return (self.first + (tap + 1)).clamp(0, self.length + 1).expand(like.shape)
+
+
+def _split(positions: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    low = positions.detach().floor()
+    return low.long(), (positions - low).to(dtype)
