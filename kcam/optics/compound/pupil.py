@@ -151,6 +151,7 @@ def opening(clearances: Tensor) -> Tensor:
 
     An edge is straight as far as the low-pass reaches, some samples; 1 - sqrt(1 - q) is nearly the distance from it.
     """
-    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=0)))
+    # in float32 q may be 1 at the middle, and the slope of a root of 0, which is infinite, times no light is NaN
+    depth = clearances / (1 + torch.sqrt((1 - clearances).clamp(min=1e-12)))
     slope = functools.reduce(torch.add, (part.square() for part in torch.gradient(depth, dim=(-2, -1))))
     return functools.reduce(torch.mul, edge_profile(depth * slope.clamp(min=1e-18).rsqrt()).unbind(1))
