@@ -11,6 +11,7 @@ from draws import Draw
 from torch import Tensor, nn
 
 from kcam import optics
+from kcam.optics.compound.pupil import opening
 from kcam.optics.compound.tracing import trace
 from kcam.units import mm, nm, um
 
@@ -251,6 +252,16 @@ def test_illumination_and_psfs_have_a_gradient_through_vignetting(name: str, hei
             (gradient,) = torch.autograd.grad(own, parameter, retain_graph=True)
             scale = float(own.detach() / parameter.detach().abs())
             assert float(gradient) == pytest.approx(float(slope), rel=2e-3, abs=1e-3 * scale)
+
+
+def test_the_middle_of_a_pupil_has_a_gradient() -> None:
+    """Where a clearance is 1: its distance from the edge has no slope there."""
+    axis = torch.linspace(-1.2, 1.2, 49)
+    clearances = (1 - axis**2 - axis[:, None] ** 2)[None, None].requires_grad_()
+    passed = opening(clearances)
+    (slope,) = torch.autograd.grad(passed.sum(), clearances)
+    assert bool(slope.isfinite().all())
+    assert float(slope.abs().amax()) > 0
 
 
 def test_light_that_cannot_pass_is_a_clear_error() -> None:
