@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from kcam.optics.regions import pixel_positions
 from kcam.optics.rendering.borders import extend
 from kcam.optics.rendering.places import Bank, Between, grid
-from kcam.optics.rendering.resampling import Resampling, resampling
+from kcam.optics.rendering.resampling import Resampling, resampling, smooth_map
 from kcam.optics.rendering.zones import Axis, blend
 from kcam.optics.source import FieldPSFs, PixelGrid
 
@@ -119,8 +118,8 @@ class FieldPicture:
         moves = self.distortion(picture)
         if moves is not None:
             planes, shares = moves(planes), None if shares is None else moves(shares)
-        places = self._centre + pixel_positions(picture, self.pixels.pitch)
-        return planes * self.psfs.illumination(places).to(planes), shares
+        light = smooth_map(lambda places: self.psfs.illumination(self._on_sensor(places)), picture)
+        return planes * light.to(planes), shares
 
     def distortion(self, picture: tuple[int, int]) -> Resampling | None:
         """From the scene's pixels to the picture's; None where nothing moves."""

@@ -11,8 +11,8 @@ from draws import Draw
 from torch import Tensor, nn
 
 from kcam import optics
-from kcam.optics.compound.pupil import opening
 from kcam.optics.compound.tracing import trace
+from kcam.optics.pupil.rim import opening
 from kcam.units import mm, nm, um
 
 DOUBLE = torch.float64

@@ -65,6 +65,13 @@ def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resamplin
     )
 
 
+def smooth_map(function: Callable[[Tensor], Tensor], picture: tuple[int, int]) -> Tensor:
+    """A function of places (..., 2) at the pixels of a picture about its middle, (H, W): linear between a few."""
+    (y, x), (height, width) = (_coarse(n) for n in picture), picture
+    places = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+    return _fine(function(places), x, y, columns=_centres(width), rows=_centres(height))
+
+
 def _coarse(n: int) -> Tensor:
     """Places from edge to edge of n pixels about their middle, at most some pixels apart."""
     return torch.linspace(-n / 2, n / 2, 2 + math.ceil(n / (_STEP if n > _LONG else 1)), dtype=torch.float64)
