@@ -475,7 +475,7 @@ class Imaging(Stage):
 
         pixels, spacing = self.pixels(window, like), self.accuracy.spacing
         whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
-        most = self.accuracy.max_memory / 4
+        most = self.accuracy.max_memory / 2
         return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole, mixing, mixed, most)
 
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
