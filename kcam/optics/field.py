@@ -24,9 +24,10 @@ ALLOWED = 1.5e-3
 """Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]."""
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
-_PROBE = 128  # pixels between the places that are tried
+PROBE = 128  # pixels between the places that are tried
 _SAMPLED = 2**18  # pixels by which a picture's light is known
 _CELLS = ((0.12, 0.09), (0.45, 0.4), (0.68, 0.74), (0.97, 0.94))  # places of the quadrant, of half its sides
+PROBED = 5 * len(_CELLS)  # places whose PSFs are computed to try
 
 Render = Callable[..., Tensor]
 """Light of PSFs (Z, G, h, w), planes (B, K, H, W) and shares of layers (B, Z, H, W), dark all around; occlusion=False:
@@ -72,7 +73,7 @@ class FieldPicture:
     """How a picture over the field is made.
 
     psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. render: of one
-    zone. border: see `Imaging`. spacing: pixels between nodes, or None. whole:
+    zone. border: see `Imaging`. spacing: pixels between nodes, inf for one PSF, or None. whole:
     the light outside the window is put back into it. mixing: weights (M, L) of what the picture adds up.
     """
 
@@ -81,7 +82,7 @@ class FieldPicture:
     centre: tuple[float, float]
     render: Render
     border: str
-    spacing: int | None = None
+    spacing: float | None = None
     whole: bool = True
     mixing: Tensor | None = None
 
@@ -129,10 +130,12 @@ class FieldPicture:
             picture = (planes.shape[-2], planes.shape[-1])
             if self.spacing is None:
                 apart, error = self.apart(planes, shares)
+            elif math.isinf(self.spacing):  # one PSF on purpose
+                apart, error = max(picture), 0.0
             else:
-                apart, error = self.spacing, self.blending_error(planes, shares, self.spacing)
+                apart, error = int(self.spacing), self.blending_error(planes, shares, int(self.spacing))
             rows, columns = (
-                len(Axis.of(n, m, apart=apart).nodes) for n, m in zip(picture, self.pixels.shape, strict=True)
+                len(Axis.of(n, m, apart=apart if self.spacing is None else self.spacing).nodes) for n, m in zip(picture, self.pixels.shape, strict=True)
             )
             return FieldEstimate((rows, columns), apart, error, **self.psfs.deviations(self.pixels, mixing=self.mixing))
 
@@ -147,7 +150,7 @@ class FieldPicture:
     def apart(self, planes: Tensor, shares: Tensor | None, *, allowed: float = ALLOWED) -> tuple[int, float]:
         """How many pixels nodes may lie apart for an error, and what error that leaves: planes as they were moved."""
         sides = (planes.shape[-2], planes.shape[-1])
-        probe = max(2, min(_PROBE, max(sides) // 2))
+        probe = max(2, min(PROBE, max(sides) // 2))
         error = self.blending_error(planes, shares, probe)
         steps = [2**k for k in range(int(math.log2(_FINEST)), int(math.log2(_COARSEST)) + 1)]
         fine = [step for step in steps if error * (step / probe) ** 2 <= allowed] or [_FINEST]

@@ -180,9 +180,14 @@ def measured(plan: Plan, camera: Camera, scene: Scene, *, rounds: int = 3) -> di
     return {"error": error} | {name: statistics.median(times) for name, times in found.items()}
 
 
+def fresh(stage: Any) -> Any:
+    """The stage, of which an Imaging has kept nothing."""
+    return stage.fresh() if isinstance(stage, Imaging) else stage
+
+
 def timed(camera: Camera, scene: Scene) -> tuple[float, torch.Tensor]:
     """Seconds of the noiseless raw with new optics, of which nothing is kept, and the raw."""
-    raw = noiseless_raw(with_imaging(camera))
+    raw = noiseless_raw(Camera(*(fresh(stage) for stage in camera), context=camera.context))
     start = time.perf_counter()
     result = raw(scene)
     return time.perf_counter() - start, result

@@ -57,9 +57,15 @@ class FieldPSFs:
     vergences: Tensor
     wavelengths: Tensor
     reach: float  # of places, from the axis [m]
+    lateral_colour: bool = True
 
     kept: dict[tuple[object, ...], tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
     kept_banks: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
+
+    def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
+        """Of others (L,) [m] in the same range; see `source.FieldPSFs`."""
+        own = {"wavelengths": wavelengths.to(torch.float64), "lateral_colour": lateral_colour}
+        return replace(self, **own, kept={}, kept_banks={})
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
@@ -107,6 +113,9 @@ class FieldPSFs:
         fitted = self._fitted(radii, wavelengths)
         chief = fitted.chief.view(len(places) + 1, len(self.vergences), -1)[:-1]
         # what is above the axis falls below it: heights of chief rays count along the object's direction
+        if not self.lateral_colour:
+            middle = self._fitted(radii, (self.wavelengths.min() + self.wavelengths.max())[None] / 2).chief
+            chief = middle.view(len(places) + 1, len(self.vergences), 1)[:-1].expand_as(chief)
         moved = chief + radii[:, None, None]
         return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
 
@@ -183,7 +192,7 @@ class FieldPSFs:
     @torch.no_grad()
     def blur(self) -> float:
         """How far rays fall from where they should, at most, over all heights in the table [m]."""
-        return float(self._spread()[0].max())
+        return float(self._spread[0].max())
 
     @torch.no_grad()
     def window(self, pixels: PixelGrid) -> tuple[int, int]:
@@ -192,7 +201,7 @@ class FieldPSFs:
         A rim of length P around an area A sends the share lambda d P / (2 pi^2 A r) beyond a radius r, see
         `Lens.window`; of each ray that falls x from the middle, what lies beyond r - x.
         """
-        slopes, area = self._spread()
+        slopes, area = self._spread
         colours = self.wavelengths.repeat(len(slopes) // len(self.wavelengths))
         # the rim of an area is that of a disc at least: 2 sqrt(pi area)
         tail = (colours * (math.pi / area).sqrt() / math.pi**2)[:, None]
@@ -205,6 +214,7 @@ class FieldPSFs:
         side = 2 * math.ceil(float(high.max()) / pixels.pitch) + 1
         return side, side
 
+    @functools.cached_property
     def _spread(self) -> tuple[Tensor, Tensor]:
         """How far shares of the light of some nodes fall from where they should [m], and the areas of their pupils."""
         radii = torch.linspace(0, self.reach, _LOOKED if self.reach else 1, dtype=torch.float64)
