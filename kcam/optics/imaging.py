@@ -561,6 +561,25 @@ class Imaging(Stage):
             found.append(field.apart(*field.moved(planes, shares))[0])
         return min(found)
 
+    def distorted(self, scene: Scene) -> float:
+        """How far distortion moves light of a picture, at most [pixels]: in its corners and the middle of its sides."""
+        places, psfs = self._outermost(scene)
+        return float((psfs.undistorted(places) - places).norm(dim=-1).max()) / self.pixel_pitch
+
+    def illuminated(self, scene: Scene) -> float:
+        """Relative illumination of an even scene where it is least: in the corners and the middle of the sides."""
+        places, psfs = self._outermost(scene)
+        return float(psfs.illumination(places).min())
+
+    @torch.no_grad()
+    def _outermost(self, scene: Scene) -> tuple[Tensor, FieldPSFs]:
+        planes = self.working(scene)
+        vergences, _ = self.layers_of(scene, planes)
+        height, width = scene.shape[-2:]
+        sides = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64) * self.pixel_pitch
+        places = torch.cartesian_prod(sides * width, sides * height) + torch.tensor(self._middle, dtype=torch.float64)
+        return places, self._traced((height, width), vergences, scene.wavelengths)
+
     def _asked(self, scene: Scene, colour_filter: Absorber | None) -> tuple[FieldPicture, Tensor, Tensor | None]:
         planes = self.working(scene)
         weights = None if colour_filter is None else colour_filter.contraction(scene.wavelengths).to(planes)

@@ -15,10 +15,11 @@ import torch
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Work
+from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw, with_imaging
+from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
@@ -146,12 +147,12 @@ class Planner:
                 self._checked[key] = self.evaluator.last(changes, skipped)
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
-            max(below, key=lambda way: way.error).climb(self.evaluator)
+            max(below, key=_urgency).climb(self.evaluator)
 
     def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
         """All choices, and what the stages of the sensor are given."""
         if self._known is None:
-            steps = [ladder for ladder in ladders(self.evaluator, self.prices.scene) if self.prices.saves(ladder)]
+            steps = [ladder for ladder in ladders(self.evaluator, self.prices.scene) if ladder.always or self.prices.saves(ladder)]
             signals = self.evaluator.signals(dict(steps[0].beside) if steps else {})
             skips = [_Skip(self.camera, index, signals) for index in self.evaluator.skippable()]
             self._known = steps, skips, signals
@@ -229,7 +230,12 @@ def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator
             ladder.price(evaluator)
         if sum(ladder.error for ladder in relevant) <= most:
             return
-        max(relevant, key=lambda ladder: ladder.error).climb(evaluator)
+        max(relevant, key=_urgency).climb(evaluator)
+
+
+def _urgency(way: Ladder | _Skip) -> float:
+    """Its error, counted more where leaving it saves nothing."""
+    return way.error * (way.urgency if isinstance(way, Ladder) else 1.0)
 
 
 class _Skip:
