@@ -56,10 +56,10 @@ class Accuracy(Recipe):
             the colours at an edge are then exact, at the cost of the bands.
         spacing: pixels between the places whose PSFs are computed, where they vary over the picture; None: as the
             estimate on the scene asks, see `Imaging.explain`.
-        field_variation, distortion, lateral_colour, relative_illumination: of optics that vary over the picture, each by
-            itself. False: every pixel sees the PSF of the axis; nothing is moved; each wavelength's chief ray falls
-            where that of the middle of the spectrum does; an even scene is as bright in the corners as on the axis. To
-            leave out all of them: Imaging(field=False).
+        field_variation, distortion, lateral_colour, relative_illumination: of optics that vary over the picture; each
+            may be False by itself. Then every pixel sees the PSF of the axis; no light is moved; chief rays of all
+            wavelengths fall where that of the spectrum's middle does; an even scene is even. `Imaging(field=False)`
+            leaves out all four.
         rank: of the scene's spectra, at most, see `Scene.low_rank`; None for its own.
         precision: "float32" computes so whatever the scene's type; None for the scene's, or float64 where its light
             spans more than float32's transforms hold, see `rendering.rounding.wide_range`.

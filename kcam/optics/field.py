@@ -135,7 +135,8 @@ class FieldPicture:
             else:
                 apart, error = int(self.spacing), self.blending_error(planes, shares, int(self.spacing))
             rows, columns = (
-                len(Axis.of(n, m, apart=apart if self.spacing is None else self.spacing).nodes) for n, m in zip(picture, self.pixels.shape, strict=True)
+                len(Axis.of(n, m, apart=apart if self.spacing is None else self.spacing).nodes)
+                for n, m in zip(picture, self.pixels.shape, strict=True)
             )
             return FieldEstimate((rows, columns), apart, error, **self.psfs.deviations(self.pixels, mixing=self.mixing))
 

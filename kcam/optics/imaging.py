@@ -353,10 +353,12 @@ class Imaging(Stage):
         """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
         return max(1, int(self.accuracy.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
 
-    def work(self, scene: Scene, *, channels: int | None = None) -> Work:
-        """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
-        if len(apart := alike(scene)) > 1:
-            works = [self.work(scene.samples(rows), channels=channels) for rows in apart]
+    def work(self, scene: Scene, *, channels: int | None = None, apart: int | None = None) -> Work:
+        """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands. A lens
+        has been traced over its field; apart: pixels between places where `spacing` leaves that to the scene, if known.
+        """
+        if len(groups_of := alike(scene)) > 1:
+            works = [self.work(scene.samples(rows), channels=channels, apart=apart) for rows in groups_of]
             return sum(works[1:], works[0])
         planes = self.working(scene)
         batch, count, height, width = planes.shape
@@ -372,7 +374,9 @@ class Imaging(Stage):
         grouped = self._psf_wavelengths(scene.wavelengths)
         groups = len(grouped)
         if self.varies:
-            return first + self._field_work(planes, count, channels, window=window, layers=layers, scene=scene)
+            psfs = self._traced((height, width), vergences, scene.wavelengths)
+            psf = {"field psf": float(layers), "field point": layers * psfs.points(self.pixels(window, planes))}
+            return first + self._field_work(scene, planes, (count, channels), window=window, psf=psf, apart=apart)
         shaped = functools.partial(planes.new_empty, device="meta")
         renderer = Renderer(
             shaped(1, groups, *window),
@@ -398,13 +402,21 @@ class Imaging(Stage):
         return first + Work(operations, rendering.memory * batch + bank + shares)
 
     def _field_work(
-        self, planes: Tensor, count: int, channels: int | None, *, window: tuple[int, int], layers: int, scene: Scene
+        self,
+        scene: Scene,
+        planes: Tensor,
+        sizes: tuple[int, int | None],
+        *,
+        window: tuple[int, int],
+        psf: dict[str, float],
+        apart: int | None,
     ) -> Work:
-        """That of one distance: PSFs of the places, and their zones. Where the places follow from the scene they count
-        as `PROBE` pixels apart, with those at which that is tried.
+        """That of one distance, over the field: PSFs of places, each of which takes `psf`, and zones. Where the places
+        follow from the scene those count too at which that is tried. sizes: planes of the scene, and channels.
         """
+        (count, channels), layers = sizes, int(psf["field psf"])
         picture, own, bands = (scene.shape[-2], scene.shape[-1]), self.accuracy, len(scene.wavelengths)
-        spacing = (own.spacing or PROBE) if own.field_variation else math.inf
+        spacing = (own.spacing or apart or PROBE) if own.field_variation else math.inf
         nodes = [len(Axis.of(n, m, apart=spacing).nodes) for n, m in zip(picture, window, strict=True)]
         zones = math.prod(nodes)
         places = float(zones if self.centre else math.prod((n + 1) // 2 for n in nodes))  # others mirror these
@@ -412,7 +424,9 @@ class Imaging(Stage):
         groups = len(self._psf_wavelengths(scene.wavelengths))
         computed = float(min(groups, _COLOURS))
         colours = 2.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
-        sides = [min(n, math.ceil(2 * n / max(1, k - 1))) + m - 1 for n, m, k in zip(picture, window, nodes, strict=True)]
+        sides = [
+            min(n, math.ceil(2 * n / max(1, k - 1))) + m - 1 for n, m, k in zip(picture, window, nodes, strict=True)
+        ]
         shaped = functools.partial(planes.new_empty, device="meta")
         factored = scene.spectra is not None or count < planes.shape[1]
         rendering = self._rendering(scene) | {"border": "zero", "picture": (sides[0], sides[1]), "cache": None}
@@ -425,8 +439,8 @@ class Imaging(Stage):
         zone = renderer.work(coverage=layers > 1 and own.occlusion)
         batch, scale = len(planes), planes.element_size() / 4
         operations = {kind: n * layers * batch * scale * (zones + tried) for kind, n in zone.operations.items()}
-        operations["layer"] = float(layers * zones)
-        operations["field psf"] = layers * ((places + tried) * computed + colours)
+        operations |= {"field": 1.0, "layer": float(layers * zones)}
+        operations |= {kind: number * ((places + tried) * computed + colours) for kind, number in psf.items()}
         operations["touch"] += 60.0 * planes.numel() * (own.distortion + 0.1 * own.relative_illumination)
         held = float(2 * nodes[1] * layers * groups * window[0] * window[1] * planes.element_size())
         shares = float(layers * picture[0] * picture[1] * batch * 16) if layers > 1 else 0.0
@@ -497,7 +511,6 @@ class Imaging(Stage):
 
     def _over_field(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """PSFs of all places of a picture, traced once for all ways to group the wavelengths."""
-        lens: Any = self.lens  # which `varies` has made sure of
         grouped, lateral = self._psf_wavelengths(wavelengths), self.accuracy.lateral_colour
         corner = self.reach(picture) if self._reach is None else self._reach
 

@@ -42,6 +42,10 @@ class SimplerField:
         """That of the optics."""
         return self.psfs.window(pixels)
 
+    def points(self, pixels: PixelGrid) -> float:
+        """Those of the optics."""
+        return self.psfs.points(pixels)
+
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> SimplerField:
         """See `source.FieldPSFs`."""
         others = self.psfs.at_wavelengths(wavelengths, lateral_colour=lateral_colour)

@@ -55,7 +55,8 @@ class Sample:
     layers of depth lie where they lie in the whole.
 
     owners: whose each row is. places: of optics that vary over the picture, where the middle of each row lies from that
-    of its whole picture, x and y, upright [pixels]; None where they are whole, or optics do not vary. factors: on their relative errors, for the part of a scene that its crops stand for.
+    of its `picture` (H, W), x and y, upright [pixels]; None where they are whole. factors: on their relative
+    errors, for the part of a scene that its crops stand for.
     """
 
     scene: Scene

@@ -152,7 +152,8 @@ class Planner:
     def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
         """All choices, and what the stages of the sensor are given."""
         if self._known is None:
-            steps = [ladder for ladder in ladders(self.evaluator, self.prices.scene) if ladder.always or self.prices.saves(ladder)]
+            every = ladders(self.evaluator, self.prices.scene)
+            steps = [ladder for ladder in every if ladder.always or self.prices.saves(ladder)]
             signals = self.evaluator.signals(dict(steps[0].beside) if steps else {})
             skips = [_Skip(self.camera, index, signals) for index in self.evaluator.skippable()]
             self._known = steps, skips, signals
@@ -288,6 +289,7 @@ class _Prices:
 
     def __init__(self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
         self.imaging, self.always = evaluator.imaging, always
+        self.apart = evaluator.apart if evaluator.varies and evaluator.samples else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
@@ -307,7 +309,7 @@ class _Prices:
     def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
         if self.imaging is None:
             return Work()
-        return self.imaging.changed(**self.always | dict(changes)).work(scene, channels=self.channels)
+        return self.imaging.changed(**self.always | dict(changes)).work(scene, channels=self.channels, apart=self.apart)
 
     def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
         """(seconds, bytes) with changes of the Imaging."""

@@ -22,6 +22,7 @@ COLOUR_ERROR = 1e-2
 OUTSIDE = 5e-3
 """Share of the light that the default window may leave out; it is put back into the window, see `Imaging`."""
 _HALVINGS = 30
+_FEWEST = 64  # samples along a pupil
 KEPT = 2e8  # bytes of PSFs that are kept
 
 
@@ -64,8 +65,8 @@ class FieldPSFs:
 
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
         """Of others (L,) [m] in the same range; see `source.FieldPSFs`."""
-        own = {"wavelengths": wavelengths.to(torch.float64), "lateral_colour": lateral_colour}
-        return replace(self, **own, kept={}, kept_banks={})
+        wavelengths = wavelengths.to(torch.float64)
+        return replace(self, wavelengths=wavelengths, lateral_colour=lateral_colour, kept={}, kept_banks={})
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
@@ -193,6 +194,15 @@ class FieldPSFs:
     def blur(self) -> float:
         """How far rays fall from where they should, at most, over all heights in the table [m]."""
         return float(self._spread[0].max())
+
+    @torch.no_grad()
+    def points(self, pixels: PixelGrid) -> float:
+        """Points of the transform that one PSF takes, about: for a planner."""
+        slopes, areas = self._spread
+        shortest = float(self.wavelengths.min())
+        per_pixel = 2 * float((areas / math.pi).sqrt().max()) * pixels.pitch / shortest
+        reach = max(pixels.shape) / 2 + QUICK.margin + float(slopes.max()) / pixels.pitch
+        return max(_FEWEST, QUICK.kappa * reach * max(1.0, per_pixel)) ** 2
 
     @torch.no_grad()
     def window(self, pixels: PixelGrid) -> tuple[int, int]:
