@@ -56,6 +56,10 @@ class Accuracy(Recipe):
             the colours at an edge are then exact, at the cost of the bands.
         spacing: pixels between the places whose PSFs are computed, where they vary over the picture; None: as the
             estimate on the scene asks, see `Imaging.explain`.
+        field_variation, distortion, lateral_colour, relative_illumination: of optics that vary over the picture; each
+            may be False by itself. Then every pixel sees the PSF of the axis; no light is moved; chief rays of all
+            wavelengths fall where that of the spectrum's middle does; an even scene is even. `Imaging(field=False)`
+            leaves out all four.
         rank: of the scene's spectra, at most, see `Scene.low_rank`; None for its own.
         precision: "float32" computes so whatever the scene's type; None for the scene's, or float64 where its light
             spans more than float32's transforms hold, see `rendering.rounding.wide_range`.
@@ -76,6 +80,10 @@ class Accuracy(Recipe):
     occlusion: bool = True
     coverage: str = "channel"
     spacing: int | None = None
+    field_variation: bool = True
+    distortion: bool = True
+    lateral_colour: bool = True
+    relative_illumination: bool = True
     rank: int | None = None
     precision: str | None = None
     max_memory: float = 2e9
@@ -134,6 +142,10 @@ class Shortcuts(TypedDict, total=False):
     occlusion: bool
     coverage: str
     spacing: int | None
+    field_variation: bool
+    distortion: bool
+    lateral_colour: bool
+    relative_illumination: bool
     rank: int | None
     precision: str | None
     max_memory: float

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,9 +25,10 @@ ALLOWED = 1.5e-3
 BETWEEN = 0.7  # of that, what PSFs between those that are computed may leave, at most
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
-_PROBE = 128  # pixels between the places that are tried
+PROBE = 128  # pixels between the places that are tried
 _SAMPLED = 2**18  # pixels by which a picture's light is known
 _CELLS = ((0.12, 0.09), (0.45, 0.4), (0.68, 0.74), (0.97, 0.94))  # places of the quadrant, of half its sides
+PROBED = 5 * len(_CELLS)  # places whose PSFs are computed to try
 
 Render = Callable[..., Tensor]
 """Light of PSFs (Z, G, h, w), planes (B, K, H, W) and shares of layers (B, Z, H, W), dark all around; occlusion=False:
@@ -76,7 +77,7 @@ class _How:
     done at each node, and the error that this leaves.
     """
 
-    apart: int
+    apart: float
     blending: float = 0.0
     known: float | None = None
     between: float = 0.0
@@ -87,9 +88,9 @@ class FieldPicture:
     """How a picture over the field is made.
 
     psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. render: of one
-    zone. border: see `Imaging`. spacing: pixels between nodes, or None. whole:
-    the light outside the window is put back into it. mixing: weights (M, L) of what the picture adds up; mixed: render
-    takes these sums. most: bytes of PSFs that are held.
+    zone. border: see `Imaging`. spacing: pixels between nodes, inf for one PSF, or None. whole: the light outside the
+    window is put back into it. mixing: weights (M, L) of what the picture adds up; mixed: render takes these sums.
+    most: bytes of PSFs that are held.
     """
 
     psfs: FieldPSFs
@@ -97,7 +98,7 @@ class FieldPicture:
     centre: tuple[float, float]
     render: Render
     border: str
-    spacing: int | None = None
+    spacing: float | None = None
     whole: bool = True
     mixing: Tensor | None = None
     mixed: bool = False
@@ -141,17 +142,18 @@ class FieldPicture:
         with torch.no_grad():
             planes, shares = self.moved(planes, shares)
             picture, how = (planes.shape[-2], planes.shape[-1]), self.how(planes, shares)
-            if self.spacing is not None:
-                how = replace(
-                    how, blending=self._left(planes, shares, [self._blended(self.bank, picture, how.apart)])[0]
-                )
             if how.known is None:
                 sides = zip(picture, self.pixels.shape, strict=True)
                 rows, columns = (len(Axis.of(n, m, apart=how.apart).nodes) for n, m in sides)
             else:
                 rows, columns = (len(grid(n, apart=how.known)) for n in picture)
+            apart, blending = how.apart, how.blending
+            if self.spacing is not None and math.isinf(self.spacing):  # one PSF on purpose
+                apart = max(picture)
+            elif self.spacing is not None:
+                blending = self._left(planes, shares, [self._blended(self.bank, picture, apart)])[0]
             deviations = self.psfs.deviations(self.pixels, mixing=self.mixing)
-            return FieldEstimate((rows, columns), how.apart, how.blending, how.between, **deviations)
+            return FieldEstimate((rows, columns), int(apart), blending, how.between, **deviations)
 
     @property
     def _centre(self) -> Tensor:
@@ -170,7 +172,7 @@ class FieldPicture:
         if self.spacing is not None:
             return _How(self.spacing)
         sides = (planes.shape[-2], planes.shape[-1])
-        probe = max(2, min(_PROBE, max(sides) // 2))
+        probe = max(2, min(PROBE, max(sides) // 2))
         known, apart, error = 2.0 * probe, _FINEST, math.inf
         while known > apart:
             if self._held(sides, known) > self.most:

@@ -21,7 +21,7 @@ from kcam.context import Context, Curves, Stage
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
 from kcam.optics.accuracy import Accuracy, Recipe, Shortcuts
-from kcam.optics.field import FieldEstimate, FieldPicture
+from kcam.optics.field import PROBE, PROBED, FieldEstimate, FieldPicture
 from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.regions import field_shares, pixel_positions
@@ -29,6 +29,8 @@ from kcam.optics.rendering.borders import BORDERS
 from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, layer_shares, warn_of_few
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
+from kcam.optics.rendering.zones import Axis
+from kcam.optics.simpler import SimplerField
 from kcam.optics.source import Defocus, FieldPSFs, FieldSource, PixelGrid, Points, PSFSource
 from kcam.precision import full_precision
 from kcam.scene import Scene
@@ -36,6 +38,8 @@ from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
 _DEFAULT = Accuracy()
 _SETTINGS = _DEFAULT.settings().keys()
+_FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
+_FEW_COLOURS, _COLOURS = 5, 12  # PSFs of more wavelengths are polynomials of those of some: that many, about
 
 
 class Absorber(Curves, Protocol):
@@ -107,7 +111,9 @@ class Imaging(Stage):
             raise TypeError(f"accuracy must be an optics.Accuracy, got {describe(accuracy)}. Use Accuracy(bands=12).")
         self.accuracy = replace(accuracy, **shortcuts)
         self._warns = True  # of too few layers
-        self._bank_cache, self._transfer_cache, self._field_cache = ValueCache(), ValueCache(), ValueCache()
+        self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
+        self._traced_cache, self._field_cache = ValueCache(), ValueCache()
+        self._reach: float | None = None  # from the axis, of the picture of which this is a part [m]
         self._check_recipe()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -134,8 +140,16 @@ class Imaging(Stage):
         """
         changed = Imaging(**(self.configuration() | arguments))
         changed._warns = self._warns and "layers" not in arguments
-        changed._field_cache = self._field_cache
+        changed._traced_cache, changed._reach = self._traced_cache, self._reach
+        if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
+            changed._field_cache = self._field_cache
         return changed
+
+    def fresh(self) -> Imaging:
+        """The same stage that has kept nothing, but for the pupils that were traced."""
+        own = self.changed()
+        own._field_cache = ValueCache()
+        return own
 
     def _check_recipe(self) -> None:
         """What asks for a method that does not exist, or for one where nothing is computed, is refused at once."""
@@ -191,7 +205,7 @@ class Imaging(Stage):
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
         if self.varies:
-            window = self._over_field(picture, vergences, wavelengths).window(pixels)
+            window = self._traced(picture, vergences, wavelengths).window(pixels)
         else:
             window = self.lens.window(Points(vergences), wavelengths, pixels)
         height, width = (min(side, n + (n + 1) % 2) for side, n in zip(window, picture, strict=True))
@@ -343,10 +357,12 @@ class Imaging(Stage):
         """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
         return max(1, int(self.accuracy.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
 
-    def work(self, scene: Scene, *, channels: int | None = None) -> Work:
-        """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands."""
-        if len(apart := alike(scene)) > 1:
-            works = [self.work(scene.samples(rows), channels=channels) for rows in apart]
+    def work(self, scene: Scene, *, channels: int | None = None, apart: int | None = None) -> Work:
+        """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands. A lens
+        has been traced over its field; apart: pixels between places where `spacing` leaves that to the scene, if known.
+        """
+        if len(groups_of := alike(scene)) > 1:
+            works = [self.work(scene.samples(rows), channels=channels, apart=apart) for rows in groups_of]
             return sum(works[1:], works[0])
         planes = self.working(scene)
         batch, count, height, width = planes.shape
@@ -361,6 +377,10 @@ class Imaging(Stage):
         channels = None if layers > 1 and self.accuracy.per_band else channels
         grouped = self._psf_wavelengths(scene.wavelengths)
         groups = len(grouped)
+        if self.varies:
+            psfs = self._traced((height, width), vergences, scene.wavelengths)
+            psf = {"field psf": float(layers), "field point": layers * psfs.points(self.pixels(window, planes))}
+            return first + self._field_work(scene, planes, (count, channels), window=window, psf=psf, apart=apart)
         shaped = functools.partial(planes.new_empty, device="meta")
         renderer = Renderer(
             shaped(1, groups, *window),
@@ -384,6 +404,51 @@ class Imaging(Stage):
         zones = 1 if self._positions is None else len(self._positions)
         operations = {kind: count * zones for kind, count in operations.items()}
         return first + Work(operations, rendering.memory * batch + bank + shares)
+
+    def _field_work(
+        self,
+        scene: Scene,
+        planes: Tensor,
+        sizes: tuple[int, int | None],
+        *,
+        window: tuple[int, int],
+        psf: dict[str, float],
+        apart: int | None,
+    ) -> Work:
+        """That of one distance, over the field: PSFs of places, each of which takes `psf`, and zones. Where the places
+        follow from the scene those count too at which that is tried. sizes: planes of the scene, and channels.
+        """
+        (count, channels), layers = sizes, int(psf["field psf"])
+        picture, own, bands = (scene.shape[-2], scene.shape[-1]), self.accuracy, len(scene.wavelengths)
+        spacing = (own.spacing or apart or PROBE) if own.field_variation else math.inf
+        nodes = [len(Axis.of(n, m, apart=spacing).nodes) for n, m in zip(picture, window, strict=True)]
+        zones = math.prod(nodes)
+        places = float(zones if self.centre else math.prod((n + 1) // 2 for n in nodes))  # others mirror these
+        tried = 0 if own.spacing is not None or not own.field_variation else PROBED
+        groups = len(self._psf_wavelengths(scene.wavelengths))
+        computed = float(min(groups, _COLOURS))
+        colours = 2.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
+        sides = [
+            min(n, math.ceil(2 * n / max(1, k - 1))) + m - 1 for n, m, k in zip(picture, window, nodes, strict=True)
+        ]
+        shaped = functools.partial(planes.new_empty, device="meta")
+        factored = scene.spectra is not None or count < planes.shape[1]
+        rendering = self._rendering(scene) | {"border": "zero", "picture": (sides[0], sides[1]), "cache": None}
+        renderer = Renderer(
+            shaped(1, groups, *window),
+            spectra=shaped(count, bands) if factored else None,
+            weights=None if channels is None else shaped(channels, bands),
+            **rendering,
+        )
+        zone = renderer.work(coverage=layers > 1 and own.occlusion)
+        batch, scale = len(planes), planes.element_size() / 4
+        operations = {kind: n * layers * batch * scale * (zones + tried) for kind, n in zone.operations.items()}
+        operations |= {"field": 1.0, "layer": float(layers * zones)}
+        operations |= {kind: number * ((places + tried) * computed + colours) for kind, number in psf.items()}
+        operations["touch"] += 60.0 * planes.numel() * (own.distortion + 0.1 * own.relative_illumination)
+        held = float(2 * nodes[1] * layers * groups * window[0] * window[1] * planes.element_size())
+        shares = float(layers * picture[0] * picture[1] * batch * 16) if layers > 1 else 0.0
+        return Work(operations, zone.memory * batch + held + shares)
 
     # ---- rendering -------------------------------------------------------------------------------------------------
 
@@ -436,14 +501,39 @@ class Imaging(Stage):
     def _middle(self) -> tuple[float, float]:
         return self.centre or (0.0, 0.0)
 
-    def _over_field(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
-        """PSFs of all places of a picture."""
-        lens: Any = self.lens  # which `varies` has made sure of
+    def reach(self, picture: tuple[int, int]) -> float:
+        """How far a picture (H, W) goes from the axis [m]."""
         half = (self.pixel_pitch * n / 2 for n in picture[::-1])
-        corner = math.hypot(*(abs(c) + side for c, side in zip(self._middle, half, strict=True)))
-        grouped = self._psf_wavelengths(wavelengths)
-        return self._field_cache.get(
-            (self.lens, corner, vergences, grouped), lambda: lens.over_field(corner, vergences, grouped)
+        return math.hypot(*(abs(c) + side for c, side in zip(self._middle, half, strict=True)))
+
+    def part(self, place: tuple[float, float], *, reach: float) -> Imaging:
+        """The same stage for a part of its picture, whose middle lies at `place`, x and y from that of the picture,
+        upright [pixels]; reach: of the whole picture [m].
+        """
+        x, y = (c - at * self.pixel_pitch for c, at in zip(self._middle, place, strict=True))
+        own = self.changed(centre=(x, y))
+        own._reach = reach
+        return own
+
+    def _over_field(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
+        """PSFs of all places of a picture, traced once for all ways to group the wavelengths."""
+        grouped, lateral = self._psf_wavelengths(wavelengths), self.accuracy.lateral_colour
+        corner = self.reach(picture) if self._reach is None else self._reach
+
+        def build() -> FieldPSFs:
+            traced = self._traced(picture, vergences, wavelengths)
+            return traced.at_wavelengths(grouped, lateral_colour=lateral)
+
+        key = (self.lens, corner, vergences, wavelengths, grouped, lateral)
+        return self._field_cache.get(key, build)
+
+    def _traced(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
+        """Those of all wavelengths, which the groups of any number take theirs from."""
+        lens: Any = self.lens  # which `varies` has made sure of
+        corner = self.reach(picture) if self._reach is None else self._reach
+        own = wavelengths if len(wavelengths) > _FEW_TRACED else self._psf_wavelengths(wavelengths)
+        return self._traced_cache.get(
+            (self.lens, corner, vergences, own), lambda: lens.over_field(corner, vergences, own)
         )
 
     def _field_picture(
@@ -473,7 +563,10 @@ class Imaging(Stage):
             layers.add(Renderer(bank, **own), first=0)
             return layers.light
 
-        pixels, spacing = self.pixels(window, like), self.accuracy.spacing
+        pixels, own = self.pixels(window, like), self.accuracy
+        spacing = own.spacing if own.field_variation else math.inf
+        if not (own.field_variation and own.distortion and own.relative_illumination):
+            psfs = SimplerField(psfs, own.field_variation, own.distortion, own.relative_illumination)
         whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
         most = self.accuracy.max_memory / 2
         return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole, mixing, mixed, most)
@@ -484,13 +577,49 @@ class Imaging(Stage):
         """
         if not self.varies:
             raise ValueError("every pixel of this picture sees one PSF: ask lens.explain() what that is off by.")
+        field, planes, shares = self._asked(scene, colour_filter)
+        return field.explain(planes, shares)
+
+    def apart(self, scene: Scene, *, colour_filter: Absorber | None = None) -> int:
+        """How many pixels lie between the places of a picture over the field, at least; arguments as of `explain`."""
+        if self.accuracy.spacing is not None:
+            return self.accuracy.spacing
+        found = []
+        for rows in alike(scene):
+            field, planes, shares = self._asked(scene.samples(rows), colour_filter)
+            found.append(int(field.how(*field.moved(planes, shares)).apart))
+        return min(found)
+
+    def distorted(self, scene: Scene) -> float:
+        """How far distortion moves light of a picture, at most [pixels]: in its corners and the middle of its sides."""
+        places, psfs = self._outermost(scene)
+        return float((psfs.undistorted(places) - places).norm(dim=-1).max()) / self.pixel_pitch
+
+    def illuminated(self, scene: Scene) -> float:
+        """Relative illumination of an even scene where it is least: in the corners and the middle of the sides."""
+        places, psfs = self._outermost(scene)
+        return float(psfs.illumination(places).min())
+
+    @torch.no_grad()
+    def _outermost(self, scene: Scene) -> tuple[Tensor, FieldPSFs]:
+        planes = self.working(scene)
+        vergences, _ = self.layers_of(scene, planes)
+        height, width = scene.shape[-2:]
+        sides = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64) * self.pixel_pitch
+        places = torch.cartesian_prod(sides * width, sides * height) + torch.tensor(self._middle, dtype=torch.float64)
+        return places, self._traced((height, width), vergences, scene.wavelengths)
+
+    def _asked(self, scene: Scene, colour_filter: Absorber | None) -> tuple[FieldPicture, Tensor, Tensor | None]:
         planes = self.working(scene)
         weights = None if colour_filter is None else colour_filter.contraction(scene.wavelengths).to(planes)
         vergences, shares = self.layers_of(scene, planes)
         picture = (planes.shape[-2], planes.shape[-1])
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=picture)
-        field = self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes)
-        return field.explain(planes, shares)
+        return (
+            self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes),
+            planes,
+            shares,
+        )
 
     def _zones(self, planes: Tensor) -> Iterator[tuple[Tensor | None, Tensor]]:
         """Positions on the sensor (1, 2) [m] at which the optics know their PSFs, and what of the light falls there."""

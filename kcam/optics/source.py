@@ -151,6 +151,12 @@ class FieldPSFs(Protocol):
     def illumination(self, places: Tensor) -> Tensor:
         """About the irradiance of an even scene at places (..., 2) [m], over that on the axis: a smooth curve > 0."""
 
+    def points(self, pixels: PixelGrid) -> float:
+        """Points of the transforms that one PSF takes, about: for a planner."""
+
+    def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
+        """Of others (L,) [m] in the same range; without `lateral_colour` all fall where the middle one does."""
+
     def deviations(self, pixels: PixelGrid, *, mixing: Tensor | None = None) -> dict[str, float]:
         """What PSFs may be off by, of their light: pupils, colours, sampling, outside; see `field.FieldEstimate`."""
 

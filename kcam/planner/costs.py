@@ -26,6 +26,9 @@ RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.valu
     "map": 1.2e-08,
     "bank": 5e-3,
     "psf": 6e-4,
+    "field": 8e-2,
+    "field psf": 2e-3,
+    "field point": 1.5e-7,
     "transform": 1.1e-10,
     "product": 8e-11,
     "touch": 1.2e-9,
@@ -35,9 +38,10 @@ RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.valu
 """Kind of work -> seconds for one operation, on the machine where the defaults were measured (one core, float32).
 
 Those of the rows of `optics.PROPAGATORS`: an operation as `Propagator.cost` counts it. map: a pixel of a DOE at a
-wavelength. bank, psf: a call, and each PSF in it. transform: n log2(n) of a real FFT of n points. product: a
-multiplication and addition in a convolution without FFT. touch: one pass over a number. large: a number of a picture of
-more than a megapixel, once if in tiles. layer: of depth, beside its transforms.
+wavelength. bank, psf: a call, and each PSF in it. field, field psf, field point: a picture over the field of a real
+lens, a PSF of one of its places, and a point of what that is computed on. transform: n log2(n) of a real FFT of n
+points. product: a multiplication and addition in a convolution without FFT. touch: one pass over a number. large: a
+number of a picture of more than a megapixel, once if in tiles. layer: of depth, beside its transforms.
 """
 
 
@@ -103,7 +107,7 @@ def calibrate(*, rounds: int = 3, advance: Callable[[str], None] | None = None) 
         found = []
         with torch.no_grad():
             for _ in range(rounds + 1):
-                fresh = imaging.changed()
+                fresh = imaging.fresh()
                 start = perf_counter()
                 fresh(scene, colour_filter=colours)
                 found.append(perf_counter() - start)
@@ -161,10 +165,13 @@ def _pictures() -> Iterator[tuple[str, optics.Imaging, Scene, ColourFilter | Non
     huge = Scene.builtin("astronaut", 1300)
     for label, tile in {"whole": None, "tiles": 256}.items():
         yield f"a huge picture, {label}", _imaging(symmetric, psf_shape=(65, 65), bands=1, tile=tile), huge, colours
+    triplet = optics.CompoundLens.preset("cooke_triplet", focus_distance=2.0)
+    for label, arguments in {"": {}, ", 3 bands": {"bands": 3}, ", 9 places": {"bands": 3, "spacing": 80}}.items():
+        yield f"over the field{label}", _imaging(triplet, **arguments), flat, colours
     yield "without blur", _imaging(symmetric, blur=False), large, colours
     yield "a cube", _imaging(symmetric, bands=2), Scene.from_bands(flat.bands(), depth=2.0), colours
     yield "a cube of low rank", _imaging(symmetric, bands=2, rank=4), Scene.from_bands(flat.bands(), depth=2.0), colours
 
 
-def _imaging(lens: optics.Lens, **arguments: Any) -> optics.Imaging:
+def _imaging(lens: optics.source.PSFSource, **arguments: Any) -> optics.Imaging:
     return optics.Imaging(lens, pixel_pitch=4 * um, **arguments)

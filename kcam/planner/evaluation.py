@@ -41,7 +41,7 @@ from kcam.planner.plan import (
 )
 from kcam.planner.survey import KINDS, TILE, Survey, survey
 from kcam.scene import Scene
-from kcam.sensor import ADC
+from kcam.sensor import ADC, ColourFilter
 from kcam.sensor.noise import RandomStage
 
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
@@ -54,12 +54,16 @@ class Sample:
     """Scenes to try choices on, or crops of them, as one batch: of the nearest and the farthest point too, so that
     layers of depth lie where they lie in the whole.
 
-    owners: whose each row is. factors: on their relative errors, for the part of a scene that its crops stand for.
+    owners: whose each row is. places: of optics that vary over the picture, where the middle of each row lies from that
+    of its `picture` (H, W), x and y, upright [pixels]; None where they are whole. factors: on their relative
+    errors, for the part of a scene that its crops stand for.
     """
 
     scene: Scene
     owners: tuple[int, ...]
     factors: tuple[float, ...]
+    places: tuple[tuple[float, float], ...] | None = None
+    picture: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -88,9 +92,12 @@ class Evaluator:
         self.defocus = Defocus() if self.imaging is None else self.imaging.defocus(scenes[0].wavelengths)
         full = [scene for scene in scenes if scene.coefficients.numel()]
         self.surveys = [survey(scene, self.raw_camera, self.defocus) for scene in full]
-        self.samples = _samples(full, self.surveys, pixels=LARGEST, side=CROP)
+        self.varies = self.imaging is not None and self.imaging.varies
+        # over the field a whole picture takes fewer PSFs than its crops: places mirror each other
+        self.samples = _samples(full, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
         self.witnesses = _samples(full, self.surveys, pixels=WITNESSED)
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
+        self.scenes = full
 
     def error(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
         """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes."""
@@ -100,6 +107,21 @@ class Evaluator:
         """True error of a finished plan on all that it is for, or on the worst of it: the worst over the scenes."""
         ours = [self._answer(sample, changes, skipped) for sample in self.witnesses]
         return _error(self.witnesses, ours, self._references)
+
+    @functools.cached_property
+    def _always(self) -> dict[str, Any]:
+        """Changes under which each trial is made: where optics vary the places are those of the reference, found once
+        on the whole scenes.
+        """
+        if self.imaging is None or not self.varies:
+            return {}
+        colours: Any = next((stage for stage in self.camera if isinstance(stage, ColourFilter)), None)
+        return {"spacing": min(self.imaging.apart(scene, colour_filter=colours) for scene in self.scenes)}
+
+    @property
+    def apart(self) -> int:
+        """Pixels between the places of the reference, of optics that vary."""
+        return int(self._always["spacing"])
 
     @functools.cached_property
     def _references(self) -> list[Answer]:
@@ -113,17 +135,32 @@ class Evaluator:
         return self._answers[key]
 
     def _answer(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Answer:
-        camera = self._with(changes, skipped)
         with torch.set_grad_enabled(self.gradients):
-            raw = camera(sample.scene)
+            raw = self._raw(sample, self._always | dict(changes), skipped)
             if not self.gradients or not raw.requires_grad:
                 return Answer(raw.detach(), tuple(torch.zeros_like(p) for p in self.parameters if self.gradients))
             with torch.no_grad():
-                sharp = self._with({"blur": False})(sample.scene)
+                sharp = self._raw(sample, {"blur": False})
             loss = (raw - sharp).square().mean() / 2
             found = torch.autograd.grad(loss, self.parameters, allow_unused=True)
         pairs = zip(found, self.parameters, strict=True)
         return Answer(raw.detach(), tuple(torch.zeros_like(p) if g is None else g for g, p in pairs))
+
+    def _raw(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Tensor:
+        camera = self._with(changes, skipped)
+        if sample.places is None or not (self.imaging and self.imaging.changed(**changes).varies):
+            return camera(sample.scene)
+        scene, reach, given = sample.scene, self.imaging.reach(sample.picture), dict(changes)
+        depth = torch.as_tensor(scene.depth, dtype=torch.float64)
+        if depth.ndim > 1:  # layers lie where they lie in the whole
+            own = self.imaging.changed(**given)
+            given["layers"] = tuple((1 / own.vergences(scene, depth)).tolist())
+        raws = []
+        for row, place in enumerate(sample.places):
+            stages = self._with(given, skipped)
+            parts = [s.part(place, reach=reach) if isinstance(s, Imaging) else s for s in stages]
+            raws.append(Camera(*parts, context=stages.context)(scene.samples([row])))
+        return torch.cat(raws)
 
     def _with(self, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Camera:
         if skipped:
@@ -148,7 +185,7 @@ class Evaluator:
         result = []
         with torch.no_grad():
             for sample in self.samples:
-                camera = self._with(settings)
+                camera = self._with(self._always | dict(settings))
                 context = self.camera.resolve(sample.scene)
                 given: dict[int, tuple[Tensor, Context]] = {}
                 if self.index != 0:
@@ -273,7 +310,11 @@ def _sample(
         depth = torch.cat(maps) if maps else torch.tensor([one.depth for one in part], dtype=torch.float64)
     together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
     owners = tuple(first + row for row, _, _ in crops)
-    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops))
+    places = None
+    if together.shape[1:] != (height, width):
+        middle = (together.shape[2] - width) / 2, (together.shape[1] - height) / 2
+        places = tuple((left + middle[0], top + middle[1]) for _, top, left in crops)
+    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops), places, (height, width))
 
 
 def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:

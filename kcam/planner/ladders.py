@@ -24,6 +24,9 @@ FEW_BANDS, FEW_LAYERS, TAIL = 3, 3, 16
 ORDER = 1.5
 """A ladder's error falls at least with this power of its step: two where it is fine enough, one where phases jump."""
 
+URGENT = 10.0
+"""Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
+
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 KAPPAS = (1.3, 1.7, 2.1)
@@ -48,6 +51,8 @@ class Ladder:
     blurs: whether it only matters where there is blur.
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers.
+    always: whether it is told of and climbed also where its foot saves no time; urgency: how much more its error counts
+    than others' where the next ladder to climb is chosen.
     """
 
     effect: str
@@ -57,6 +62,8 @@ class Ladder:
     blurs: bool = True
     alternatives: Callable[[Level], list[Level]] | None = None
     follows: Ladder | None = None
+    always: bool = False
+    urgency: float = 1.0
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
 
@@ -83,7 +90,7 @@ class Ladder:
         key = self._key(self.position)
         if self.at_top or key in self.errors:
             return
-        if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing
+        if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing, one PSF has one colour
             self.errors[key] = 0.0
             return
         beside = self.beside | (self.follows.level.changes if self.follows else {})
@@ -137,8 +144,27 @@ class _View:
             query = lens.question(Points(ends), scene.wavelengths, pixels, imaging.accuracy)
             self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
             self.row = None if imaging.varies else imaging.accuracy.row(query)
+        elif evaluator.varies:
+            self.blur = float(evaluator.defocus.radius(ends).max()) * imaging.pixel_pitch
+        self.apart = evaluator.apart if evaluator.varies else None
+        self.largest = CROP if any(sample.places for sample in evaluator.samples) else max(scene.shape[1:])
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.beside = self.few()
+
+    def places(self, apart: float) -> tuple[int, int]:
+        """Rows and columns of places so far apart at most [pixels]."""
+        height, width = self.scene.shape[1:]
+        return 1 + math.ceil((height - 1) / apart), 1 + math.ceil((width - 1) / apart)
+
+    @property
+    def shift(self) -> str:
+        """How far distortion moves light, at most."""
+        return f"up to {self.imaging.distorted(self.scene):.2g} px"
+
+    @property
+    def darkest(self) -> str:
+        """What the darkest corner has of the light on the axis."""
+        return f"down to {self.imaging.illuminated(self.scene):.0%}"
 
     def few(self, *, bands: bool = True, layers: bool = True, window: bool = True) -> dict[str, Any]:
         """Cheap settings of the others."""
@@ -150,6 +176,8 @@ class _View:
         core = 2 * (math.ceil(self.blur / self.imaging.pixel_pitch) + TAIL) + 1
         if window and core < 0.75 * max(self.window):
             few["psf_shape"] = (min(core, self.window[0]), min(core, self.window[1]))
+        if self.apart is not None:  # the middle, the sides and the corners
+            few["spacing"] = max(self.apart, math.ceil((self.largest - 1) / 2))
         return few
 
 
@@ -250,8 +278,46 @@ def _support(view: _View) -> Iterator[Ladder]:
     yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled)
 
 
+def _field(view: _View) -> Iterator[Ladder]:
+    """Of optics that vary over the picture."""
+    if view.apart is None:
+        return
+    imaging, beside = view.imaging, view.few()
+    beside.pop("spacing", None)
+    counts: dict[tuple[int, int], int] = {}
+    spacing = view.largest
+    while spacing > view.apart:
+        counts.setdefault(view.places(spacing), spacing)
+        spacing //= 2
+    counts.pop(own := view.places(view.apart), None)
+    counts[own] = view.apart
+    levels = [
+        Level(f"{rows} x {columns} places", {"spacing": apart}, rows * columns)
+        for (rows, columns), apart in counts.items()
+    ]
+    foot = [] if view.trained else [Level("1 PSF", {"field_variation": False}, 1)]
+    if not imaging.accuracy.field_variation:
+        levels, foot = [Level("1 PSF", {}, 1)], []
+    variation = Ladder("field variation", [*foot, *levels], beside, always=True)
+    yield variation
+    few = view.few()
+    for effect, size, follows in (
+        ("distortion", view.shift, None),
+        ("lateral colour", "kept", variation),
+        ("relative illumination", view.darkest, None),
+    ):
+        name = effect.replace(" ", "_")
+        levels = [Level("none", {name: False}), Level(size, {})]
+        if not getattr(imaging.accuracy, name):
+            levels = [Level("none", {})]
+        elif view.trained:
+            levels = levels[1:]
+        yield Ladder(effect, levels, beside if follows else few, follows=follows, always=True, urgency=URGENT)
+
+
 LADDERS: Sequence[Callable[[_View], Iterator[Ladder]]] = (
     _blur,
+    _field,
     _model,
     _sampling,
     _precision,

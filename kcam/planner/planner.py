@@ -15,10 +15,11 @@ import torch
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Work
+from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw, with_imaging
+from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
@@ -146,12 +147,13 @@ class Planner:
                 self._checked[key] = self.evaluator.last(changes, skipped)
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
-            max(below, key=lambda way: way.error).climb(self.evaluator)
+            max(below, key=_urgency).climb(self.evaluator)
 
     def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
         """All choices, and what the stages of the sensor are given."""
         if self._known is None:
-            steps = [ladder for ladder in ladders(self.evaluator, self.prices.scene) if self.prices.saves(ladder)]
+            every = ladders(self.evaluator, self.prices.scene)
+            steps = [ladder for ladder in every if ladder.always or self.prices.saves(ladder)]
             signals = self.evaluator.signals(dict(steps[0].beside) if steps else {})
             skips = [_Skip(self.camera, index, signals) for index in self.evaluator.skippable()]
             self._known = steps, skips, signals
@@ -180,9 +182,14 @@ def measured(plan: Plan, camera: Camera, scene: Scene, *, rounds: int = 3) -> di
     return {"error": error} | {name: statistics.median(times) for name, times in found.items()}
 
 
+def fresh(stage: Any) -> Any:
+    """The stage, of which an Imaging has kept nothing."""
+    return stage.fresh() if isinstance(stage, Imaging) else stage
+
+
 def timed(camera: Camera, scene: Scene) -> tuple[float, torch.Tensor]:
     """Seconds of the noiseless raw with new optics, of which nothing is kept, and the raw."""
-    raw = noiseless_raw(with_imaging(camera))
+    raw = noiseless_raw(Camera(*(fresh(stage) for stage in camera), context=camera.context))
     start = time.perf_counter()
     result = raw(scene)
     return time.perf_counter() - start, result
@@ -224,7 +231,12 @@ def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator
             ladder.price(evaluator)
         if sum(ladder.error for ladder in relevant) <= most:
             return
-        max(relevant, key=lambda ladder: ladder.error).climb(evaluator)
+        max(relevant, key=_urgency).climb(evaluator)
+
+
+def _urgency(way: Ladder | _Skip) -> float:
+    """Its error, counted more where leaving it saves nothing."""
+    return way.error * (way.urgency if isinstance(way, Ladder) else 1.0)
 
 
 class _Skip:
@@ -277,6 +289,7 @@ class _Prices:
 
     def __init__(self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
         self.imaging, self.always = evaluator.imaging, always
+        self.apart = evaluator.apart if evaluator.varies and evaluator.samples else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
@@ -296,7 +309,7 @@ class _Prices:
     def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
         if self.imaging is None:
             return Work()
-        return self.imaging.changed(**self.always | dict(changes)).work(scene, channels=self.channels)
+        return self.imaging.changed(**self.always | dict(changes)).work(scene, channels=self.channels, apart=self.apart)
 
     def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
         """(seconds, bytes) with changes of the Imaging."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from kcam.optics.compound.table import PupilTable
 from kcam.optics.source import PixelGrid
 
 _LOOKED = 9  # heights at which a window is asked for
+_FEWEST = 64  # samples along a pupil
 
 
 def bank(
@@ -51,6 +52,11 @@ class FieldPSFs:
     vergences: Tensor
     wavelengths: Tensor
     reach: float  # of places, from the axis [m]
+    lateral_colour: bool = True
+
+    def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
+        """Of others (L,) [m] in the same range; see `source.FieldPSFs`."""
+        return replace(self, wavelengths=wavelengths.to(torch.float64), lateral_colour=lateral_colour)
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
@@ -86,6 +92,9 @@ class FieldPSFs:
         fitted = self._fitted(radii, wavelengths)
         chief = fitted.chief.view(len(places) + 1, len(self.vergences), -1)[:-1]
         # what is above the axis falls below it: heights of chief rays count along the object's direction
+        if not self.lateral_colour:
+            middle = self._fitted(radii, (self.wavelengths.min() + self.wavelengths.max())[None] / 2).chief
+            chief = middle.view(len(places) + 1, len(self.vergences), 1)[:-1].expand_as(chief)
         moved = chief + radii[:, None, None]
         return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
 
@@ -133,7 +142,16 @@ class FieldPSFs:
     @torch.no_grad()
     def blur(self) -> float:
         """How far rays fall from where they should, at most, over all heights in the table [m]."""
-        return float(self._spread()[0].max())
+        return float(self._spread[0].max())
+
+    @torch.no_grad()
+    def points(self, pixels: PixelGrid) -> float:
+        """Points of the transform that one PSF takes, about: for a planner."""
+        slopes, areas = self._spread
+        shortest = float(self.wavelengths.min())
+        per_pixel = 2 * float((areas / math.pi).sqrt().max()) * pixels.pitch / shortest
+        reach = max(pixels.shape) / 2 + QUICK.margin + float(slopes.max()) / pixels.pitch
+        return max(_FEWEST, QUICK.kappa * reach * max(1.0, per_pixel)) ** 2
 
     @torch.no_grad()
     def window(self, pixels: PixelGrid) -> tuple[int, int]:
@@ -142,13 +160,14 @@ class FieldPSFs:
         A rim of length P around an area A sends the share lambda d P / (2 pi^2 A r) beyond a radius r, see
         `Lens.window`; of each ray that falls x from the middle, what lies beyond r - x.
         """
-        slopes, area = self._spread()
+        slopes, area = self._spread
         colours = self.wavelengths.repeat(len(slopes) // len(self.wavelengths))
         # the rim of an area is that of a disc at least: 2 sqrt(pi area)
         tail = (colours * (math.pi / area).sqrt() / math.pi**2)[:, None]
         side = window_side(slopes, tail, pitch=pixels.pitch)
         return side, side
 
+    @functools.cached_property
     def _spread(self) -> tuple[Tensor, Tensor]:
         """How far shares of the light of some nodes fall from where they should [m], and the areas of their pupils."""
         radii = torch.linspace(0, self.reach, _LOOKED if self.reach else 1, dtype=torch.float64)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from kcam.cache import ValueCache
 from kcam.inputs import as_values
 from kcam.optics.compound import analysis, pupil
 from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
@@ -85,6 +86,7 @@ class CompoundLens(nn.Module):
         if surfaces[-1].glass is not None:
             raise ValueError("the last surface has glass behind it, but the sensor stands in air: glass=None.")
         self.surfaces = nn.ModuleList(surfaces)  # type: ignore[assignment]
+        self._heights_cache = ValueCache()
         self.focus_wavelength = float(wavelength_grid([focus_wavelength]))
         place_sensor(self, focus_distance, sensor_distance, image_distance=self._focused)
 
@@ -471,7 +473,7 @@ class CompoundLens(nn.Module):
         [m].
         """
         self.check()
-        heights = self.image_heights(max(reach, 1e-9))
+        heights = self._heights_cache.get((self, reach), lambda: self.image_heights(max(reach, 1e-9)))
         square = torch.tensor(reach, dtype=torch.float64) ** 2
         highest = reach * float(heights.over_radius.at(square).detach())
         table = tabulate(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcam.optics.banks import OUTSIDE, Banks, window_side
+from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.off_axis import ERROR, Seen, off_axis_psf, relative_illumination
 from kcam.optics.propagation.question import Query
 from kcam.optics.source import PixelGrid, Points
@@ -60,6 +61,16 @@ class ThinFieldPSFs:
     def _seen(self, places: Tensor) -> Query:
         """The query of one point for each place."""
         return replace(self.query, points=Points(self.query.vergences[:1].expand(len(places)), places))
+
+    def points(self, pixels: PixelGrid) -> float:
+        """Points of the transforms that one PSF takes, about: for a planner."""
+        query = self.query
+        count = max(samples_by_rule(replace(query, grid=pixels), index) for index in range(len(query.wavelengths)))
+        return float(count) ** 2
+
+    def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> ThinFieldPSFs:
+        """Of others (L,) [m]; chief rays of all wavelengths fall together, with lateral colour or without."""
+        return replace(self, query=replace(self.query, wavelengths=wavelengths.to(self.query.wavelengths)))
 
     def undistorted(self, places: Tensor) -> Tensor:
         """The places: chief rays go straight on."""

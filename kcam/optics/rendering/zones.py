@@ -35,8 +35,8 @@ class Axis:
     last: list[int]
 
     @classmethod
-    def of(cls, n: int, window: int, *, apart: int) -> Axis:
-        """Nodes at both ends and at most `apart` pixels from the next."""
+    def of(cls, n: int, window: int, *, apart: float) -> Axis:
+        """Nodes at both ends and at most `apart` pixels from the next; of inf one, that stands for all."""
         count = 1 + math.ceil((n - 1) / apart)
         nodes = (
             torch.linspace(-(n - 1) / 2, (n - 1) / 2, count, dtype=torch.float64) if n > 1 else torch.zeros(1).double()
@@ -54,7 +54,7 @@ def blend(
     render: Render,
     *,
     window: tuple[int, int],
-    apart: int,
+    apart: float,
     border: str,
 ) -> Tensor:
     """The picture (B, C, H, W) of planes (B, K, H, W), with PSFs at nodes at most `apart` pixels from the next.
