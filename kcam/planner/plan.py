@@ -36,7 +36,8 @@ GROWTH = 4.0
 """Times the error of the last trial, up to which a later scene's is foretold."""
 
 LEAST, COLOUR, DEPTH, RING, OTHER_LIGHT = 1e-6, 0.01, 0.1, 0.1, 1.5
-"""Potentials, and shares of bands, distances and rings, beside which smaller ones do not count; how far those may differ."""
+"""Potentials, and shares of bands, distances and rings, beside which smaller ones do not count; how far those may
+differ."""
 
 WAYS = {"direct", "tile", "max_memory"}
 """Changes of an Imaging that have one result."""
@@ -69,8 +70,8 @@ class Range:
     empty, and not asked for: contrast: RMS between neighbouring pixels, relative to what is recorded. potential: of
     the `KINDS` of what a choice could hurt, the most, relative likewise. light, depths: the largest share of each band
     and of each range of defocus. saturated: the least light beyond what is recorded, relative likewise. darkest,
-    brightest: RMS of what is recorded [share of the full well]. defocus: how the lens blurred. rings: the largest share of
-    contrast in each ring about the middle of the picture.
+    brightest: RMS of what is recorded [share of the full well]. defocus: how the lens blurred.
+    rings: the largest share of contrast in each ring about the middle of the picture.
     """
 
     height: int
