@@ -170,12 +170,18 @@ T = TypeVar("T")
 
 
 class ValueCache:
-    """One result, a tensor or a dataclass of kcam that holds some, and the values that it was computed from."""
+    """The last results, tensors or dataclasses of kcam that hold some, and the values that they were computed from.
 
-    _kept: tuple[Any, tuple[Tensor, ...], Any] | None = None  # set and read at once: other threads use it too
+    entries: how many.
+    """
+
+    _kept: tuple[tuple[Any, tuple[Tensor, ...], Any], ...] = ()  # set and read at once: other threads use it too
+
+    def __init__(self, entries: int = 1) -> None:
+        self.entries = entries
 
     def get(self, key: Any, build: Callable[[], T]) -> T:
-        """The kept result if `key`, of whatever it depends on, has the value of the kept one, else a new one.
+        """The kept result if `key`, of whatever it depends on, has the value of one of the kept, else a new one.
 
         It must not be changed in place. Inference mode has a result of its own, which autograd refuses outside.
         """
@@ -189,18 +195,18 @@ class ValueCache:
             return build()
         if any(map(_recorded, tensors)):
             return build()
-        kept = self._kept
-        if kept is not None and kept[0] == key and all(map(_same_bits, kept[1], tensors)):
-            return kept[2]  # type: ignore[no-any-return]
+        for kept in self._kept:
+            if kept[0] == key and all(map(_same_bits, kept[1], tensors)):
+                return kept[2]  # type: ignore[no-any-return]
         before = tuple(tensor.detach().clone() for tensor in tensors)
         value = build()
         if not _has_derivative(value):
-            self._kept = key, before, value
+            self._kept = ((key, before, value), *self._kept)[: self.entries]
         return value
 
-    def __reduce__(self) -> tuple[type[ValueCache], tuple[()]]:
+    def __reduce__(self) -> tuple[type[ValueCache], tuple[int]]:
         """A copy has kept nothing."""
-        return ValueCache, ()
+        return ValueCache, (self.entries,)
 
 
 def _has_derivative(value: Any) -> bool:

@@ -39,6 +39,7 @@ from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 _DEFAULT = Accuracy()
 _SETTINGS = _DEFAULT.settings().keys()
 _FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
+_TRACED = 4  # lenses, at some vergences and wavelengths, whose pupils are kept
 _FEW_COLOURS, _COLOURS = 5, 12  # PSFs of more wavelengths are polynomials of those of some: that many, about
 
 
@@ -112,7 +113,7 @@ class Imaging(Stage):
         self.accuracy = replace(accuracy, **shortcuts)
         self._warns = True  # of too few layers
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
-        self._traced_cache, self._field_cache = ValueCache(), ValueCache()
+        self._traced_cache, self._field_cache = ValueCache(_TRACED), ValueCache()
         self._reach: float | None = None  # from the axis, of the picture of which this is a part [m]
         self._check_recipe()
 

@@ -35,8 +35,9 @@ SAFETY = 1.25
 GROWTH = 4.0
 """Times the error of the last trial, up to which a later scene's is foretold."""
 
-LEAST, COLOUR, DEPTH, OTHER_LIGHT = 1e-6, 0.01, 0.1, 1.5
-"""Potentials, and shares of bands and distances, beside which smaller ones do not count; how far those may differ."""
+LEAST, COLOUR, DEPTH, RING, OTHER_LIGHT = 1e-6, 0.01, 0.1, 0.1, 1.5
+"""Potentials, and shares of bands, distances and rings, beside which smaller ones do not count; how far those may
+differ."""
 
 WAYS = {"direct", "tile", "max_memory"}
 """Changes of an Imaging that have one result."""
@@ -70,6 +71,7 @@ class Range:
     the `KINDS` of what a choice could hurt, the most, relative likewise. light, depths: the largest share of each band
     and of each range of defocus. saturated: the least light beyond what is recorded, relative likewise. darkest,
     brightest: RMS of what is recorded [share of the full well]. defocus: how the lens blurred.
+    rings: the largest share of contrast in each ring about the middle of the picture.
     """
 
     height: int
@@ -85,6 +87,7 @@ class Range:
     darkest: float = 0.0
     brightest: float = 0.0
     defocus: Defocus | None = None
+    rings: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, scenes: Sequence[Scene], surveys: Sequence[Survey], defocus: Defocus) -> Range:
@@ -111,6 +114,7 @@ class Range:
             darkest=min((found.level for found in surveys), default=0.0),
             brightest=max((found.level for found in surveys), default=0.0),
             defocus=defocus,
+            rings=tuple(torch.stack([_rings(found) for found in surveys]).amax(0).tolist()) if surveys else (),
         )
 
     def growth(self, found: Survey, changes: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
@@ -127,6 +131,9 @@ class Range:
         if depth:
             share, known = shares(found.depths), torch.tensor(self.depths).to(found.depths)
             yield "light at some distances", float(((share + DEPTH) / (known + DEPTH)).max()) ** 2 / OTHER_LIGHT
+        if self.rings and {"field_variation", "spacing", "distortion", "relative_illumination"} & set(changes):
+            share, known = _rings(found), torch.tensor(self.rings).double()
+            yield "contrast as far from the middle", float(((share + RING) / (known + RING)).max()) ** 2 / OTHER_LIGHT
         light, known = shares(found.light), torch.tensor(self.light).to(found.light)
         ratios = (light + COLOUR) / (known + COLOUR)
         band = int(ratios.argmax())
@@ -366,6 +373,14 @@ def relative_rms(a: Tensor, b: Tensor) -> float:
 def shares(values: Tensor) -> Tensor:
     """Of the root of the sum of squares."""
     return values / values.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+
+
+def _rings(found: Survey) -> Tensor:
+    """Share of the contrast between neighbours in rings about the middle of the picture, by tiles, (4,)."""
+    energy = found.potential[NEIGHBOURS]
+    y, x = (torch.linspace(-1, 1, 2 * n + 1, dtype=torch.float64)[1::2] for n in energy.shape)
+    ring = (4 * (y[:, None] ** 2 + x**2).div(2).sqrt()).long().clamp(max=3)
+    return shares(torch.bincount(ring.flatten(), energy.double().flatten(), minlength=4).sqrt())
 
 
 def _unevenness(light: Tensor, groups: int) -> float:

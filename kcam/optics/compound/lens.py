@@ -446,6 +446,8 @@ class CompoundLens(nn.Module):
 
         Raises: ValueError for a sensor that reaches beyond the field of the lens.
         """
+        if reach == 0:
+            return ImageHeights(Even(1 / self.image_scale[None], 1.0), self.image_scale)
         grid, focus = wavelength_grid([self.focus_wavelength]), self._focus()[None]
         scale = self.image_scale
 
@@ -473,7 +475,7 @@ class CompoundLens(nn.Module):
         [m].
         """
         self.check()
-        heights = self._heights_cache.get((self, reach), lambda: self.image_heights(max(reach, 1e-9)))
+        heights = self._heights_cache.get((self, reach), lambda: self.image_heights(reach))
         square = torch.tensor(reach, dtype=torch.float64) ** 2
         highest = reach * float(heights.over_radius.at(square).detach())
         table = tabulate(
