@@ -15,7 +15,7 @@ import torch
 from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
-from kcam.planner.evaluation import Evaluator
+from kcam.planner.evaluation import CROP, Evaluator
 from kcam.scene import Scene
 
 FEW_BANDS, FEW_LAYERS, TAIL = 3, 3, 16
