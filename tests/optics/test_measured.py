@@ -35,12 +35,6 @@ def measured(lens: optics.Lens, side: int = 25, *, pitch: float = PITCH, **argum
     return optics.MeasuredPSF(psfs, wavelengths=BANDS, distances=DISTANCES, pixel_pitch=pitch, **arguments)
 
 
-def test_a_lens_knows_the_axis_alone() -> None:
-    lens, pixels = random_lens(Draw(0)), PixelGrid(PITCH, (5, 5))
-    with pytest.raises(ValueError, match="that on the axis"):
-        lens.bank(Points(torch.zeros(1), positions=torch.ones(1, 2) * mm), BANDS, pixels)
-
-
 def some(**changes) -> optics.MeasuredPSF:
     arguments = {"psfs": torch.ones(1, 2, 3, 3) / 9, "wavelengths": [450 * nm, 650 * nm], "distances": [2.0]}
     return optics.MeasuredPSF(**(arguments | {"pixel_pitch": PITCH} | changes))
