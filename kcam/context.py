@@ -7,6 +7,7 @@ that its stages provide when it is built, and those that the scene provides at e
 from __future__ import annotations
 
 import inspect
+from collections.abc import Container
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -73,10 +74,10 @@ class Context:
     black_level: float = 0.0
 
 
-def arguments_text(module: nn.Module) -> str:
+def arguments_text(module: nn.Module, *, but: Container[str] = ()) -> str:
     """The constructor arguments that a module holds, as ``print`` shows them: a tensor of many values by its shape.
 
-    Modules among them print themselves, and what was left open is left out.
+    Modules among them print themselves, and what was left open is left out, as are names in `but`.
     """
     configuration: Any = getattr(module, "configuration", None)
     if callable(configuration):
@@ -86,6 +87,8 @@ def arguments_text(module: nn.Module) -> str:
         held = {name: own.get(name) for name in inspect.signature(type(module)).parameters}
     shown = []
     for name, value in held.items():
+        if name in but:
+            continue
         if isinstance(value, Tensor):
             value = f"{value.item():g}" if value.numel() == 1 else tuple(value.shape)
             shown.append(f"{name}={value}")

@@ -18,6 +18,8 @@ from kcam.optics.source import is_count
 from kcam.units import check_distances
 
 COVERAGES = ("channel", "band")
+OVER_THE_FIELD = ("field_variation", "distortion", "lateral_colour", "relative_illumination")
+"""What optics may do that vary over the picture, each of which can be left out by itself."""
 
 
 @dataclass(frozen=True)

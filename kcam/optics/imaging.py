@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from kcam.cache import ValueCache, differentiated
-from kcam.context import Context, Curves, Stage
+from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
-from kcam.optics.accuracy import Accuracy, Recipe, Shortcuts
+from kcam.optics.accuracy import OVER_THE_FIELD, Accuracy, Recipe, Shortcuts
 from kcam.optics.field import PROBE, PROBED, FieldEstimate, FieldPicture
 from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
@@ -132,6 +132,10 @@ class Imaging(Stage):
         """Constructor arguments, for saving: those of the accuracy one by one."""
         names = ("lens", "pixel_pitch", "fill_factor", "integrate", "border", "distance", "field", "centre")
         return {name: getattr(self, name) for name in names} | self.accuracy.settings()
+
+    def extra_repr(self) -> str:
+        """The arguments, but for those of optics that vary over the picture where these do not."""
+        return arguments_text(self, but=() if self.varies else OVER_THE_FIELD)
 
     def changed(self, **arguments: Any) -> Imaging:
         """The same stage with some of its constructor's arguments changed; it shares the lens and what is known of its

@@ -19,6 +19,7 @@ from kcam import files
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context
 from kcam.optics import Imaging
+from kcam.optics.accuracy import OVER_THE_FIELD
 from kcam.optics.source import Defocus
 from kcam.plain import from_json
 from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Survey, survey
@@ -71,7 +72,7 @@ class Range:
     the `KINDS` of what a choice could hurt, the most, relative likewise. light, depths: the largest share of each band
     and of each range of defocus. saturated: the least light beyond what is recorded, relative likewise. darkest,
     brightest: RMS of what is recorded [share of the full well]. defocus: how the lens blurred.
-    rings: the largest share of contrast in each ring about the middle of the picture.
+    rings: the largest share of contrast in each ring about the middle of the picture, of optics that vary over it.
     """
 
     height: int
@@ -90,7 +91,7 @@ class Range:
     rings: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, scenes: Sequence[Scene], surveys: Sequence[Survey], defocus: Defocus) -> Range:
+    def of(cls, scenes: Sequence[Scene], surveys: Sequence[Survey], defocus: Defocus, *, varies: bool = False) -> Range:
         """The range that scenes span, by what was found in each item of their batches."""
         ends = []
         for scene in scenes:
@@ -114,7 +115,9 @@ class Range:
             darkest=min((found.level for found in surveys), default=0.0),
             brightest=max((found.level for found in surveys), default=0.0),
             defocus=defocus,
-            rings=tuple(torch.stack([_rings(found) for found in surveys]).amax(0).tolist()) if surveys else (),
+            rings=tuple(torch.stack([_rings(found) for found in surveys]).amax(0).tolist())
+            if surveys and varies
+            else (),
         )
 
     def growth(self, found: Survey, changes: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
@@ -131,7 +134,7 @@ class Range:
         if depth:
             share, known = shares(found.depths), torch.tensor(self.depths).to(found.depths)
             yield "light at some distances", float(((share + DEPTH) / (known + DEPTH)).max()) ** 2 / OTHER_LIGHT
-        if self.rings and {"field_variation", "spacing", "distortion", "relative_illumination"} & set(changes):
+        if self.rings and {"spacing", *OVER_THE_FIELD} & set(changes):
             share, known = _rings(found), torch.tensor(self.rings).double()
             yield "contrast as far from the middle", float(((share + RING) / (known + RING)).max()) ** 2 / OTHER_LIGHT
         light, known = shares(found.light), torch.tensor(self.light).to(found.light)

@@ -118,7 +118,10 @@ class Planner:
             skipped=tuple(skipped),
             stages=tuple(type(stage).__name__ for stage in self.camera),
             range=Range.of(
-                self.scenes, [one for found in self.evaluator.surveys for one in found], self.evaluator.defocus
+                self.scenes,
+                [one for found in self.evaluator.surveys for one in found],
+                self.evaluator.defocus,
+                varies=self.evaluator.varies,
             ),
             gradients=self.evaluator.gradients,
             trained=tuple(name for name, p in self.camera.named_parameters() if p.requires_grad)

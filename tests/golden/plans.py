@@ -37,6 +37,8 @@ def of_plan(plan: Plan) -> Answer:
     for row in rows:
         row.pop("why")  # the same numbers in words
     plain["range"].pop("contrast")
+    if not plain["range"]["rings"]:  # of optics that vary over the picture, which came later
+        plain["range"].pop("rings")
     seen = plain["range"].pop("potential"), plain["range"].pop("light"), plain["range"].pop("depths")
     levels = [plain["range"].pop(name) for name in ("saturated", "darkest", "brightest")] + [plain.pop("allowed")]
     return {
@@ -85,7 +87,9 @@ def of_a_file(name: str) -> Answer:
         taken = plan.apply(camera)
         picture = noiseless(taken)(scene)
         error = plan.measure(camera, scene)
-    same = json.loads(plan.to_json()) == json.loads((FILES / f"{name}.json").read_text())
+    again, kept = json.loads(plan.to_json()), json.loads((FILES / f"{name}.json").read_text())
+    added = again["range"].keys() - kept["range"].keys()  # by later commits
+    same = not any(again["range"].pop(name) for name in added) and again == kept
     stages = [type(stage).__name__ for stage in taken]
     return in_float32({"same": same, "stages": stages, "picture": picture, "error": torch.tensor(error)})
 

@@ -50,6 +50,10 @@ def random_settings(draw: Draw) -> dict[str, typing.Any]:
         "tile": draw.one_of(5, 8, 12),
         "direct": True,
         "spacing": draw.one_of(8, 64),
+        "field_variation": False,
+        "distortion": False,
+        "lateral_colour": False,
+        "relative_illumination": False,
     }
     assert every.keys() == {field.name for field in fields(optics.Accuracy)}
     return {name: value for name, value in every.items() if draw.number(0, 1) < 0.4}
