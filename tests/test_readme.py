@@ -36,7 +36,7 @@ EXAMPLES = {
     "train_segmentation": ["--quick", "--out", "training.json"],
     "plan_scenes": ["--size", "40", "--out", "plans"],
 }
-SLOW = ("plan_scenes", "train_lens")
+SLOW = ("plan_scenes", "train_lens", "augmentation_gallery")
 
 
 def load(path: Path) -> ModuleType:

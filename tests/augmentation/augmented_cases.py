@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import kornia.augmentation as K
+import pytest
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
@@ -30,6 +31,7 @@ class Case:
     build: the augmentation, given ranges and Kornia's own arguments. ranges: all its drawn numbers that have a slope,
     with bounds of which each end has an effect on `picture()`. fixed: other arguments. seeded: it has random fields.
     rough: steps, Poisson noise or straight-through gradients, so that its slope is no difference quotient.
+    slow: a call takes a second: `make test` takes a sample of its tests.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Case:
     seeded: bool = False
     rough: bool = False
     changes_gray: bool = True
+    slow: bool = False
 
     def __call__(self, **arguments: Any) -> Any:
         return self.build(**{**self.fixed, **self.ranges, **arguments})
@@ -51,6 +54,10 @@ class Case:
     def channels(self) -> tuple[int, ...]:
         """Numbers of channels that it takes."""
         return (3, *([1] if self.gray else []), *([28] if self.cubes else []))
+
+    def marks(self) -> list[pytest.MarkDecorator]:
+        """Of the tests that are not in the sample."""
+        return [pytest.mark.slow] if self.slow else []
 
     def channels_after(self, channels: int) -> int:
         """What it gives for them."""
@@ -129,7 +136,7 @@ CASES: tuple[Case, ...] = (
         {"k1": (-0.2, -0.1), "k2": (0.01, 0.05), "p1": (0.001, 0.01), "p2": (0.001, 0.01)},
         geometric=True,
     ),
-    Case("lens", shared_lens, fixed={"reach": (0.2, 0.4), "steps": 2}, geometric=True),
+    Case("lens", shared_lens, fixed={"reach": (0.2, 0.4), "steps": 2}, geometric=True, slow=True),
     Case("vignetting", KC.RandomVignetting, {"field": (40.0, 80.0), "shade": (0.1, 0.4)}),
     Case("bayer", KC.RandomBayer, cube_to_picture=True),
     Case("x_trans", KC.RandomBayer, fixed={"pattern": "x_trans"}, cube_to_picture=True),

@@ -25,13 +25,17 @@ from kcam import Camera
 def table(wanted: Callable[[Case], bool] = lambda case: True) -> pytest.MarkDecorator:
     """Rows of the table for which something holds, as the parameter `case`."""
     rows = [case for case in CASES if wanted(case)]
-    return pytest.mark.parametrize("case", rows, ids=[case.name for case in rows])
+    return pytest.mark.parametrize("case", [pytest.param(case, id=case.name, marks=case.marks()) for case in rows])
 
 
 def table_of_channels() -> pytest.MarkDecorator:
-    """Every row with every number of channels that it takes."""
-    rows = [(case, channels) for case in CASES for channels in case.channels()]
-    return pytest.mark.parametrize(("case", "channels"), rows, ids=[f"{case.name}-{n}" for case, n in rows])
+    """Every row with every number of channels that it takes; `make test` tries a slow one with three."""
+    rows = [
+        pytest.param(case, channels, id=f"{case.name}-{channels}", marks=case.marks() if channels != 3 else [])
+        for case in CASES
+        for channels in case.channels()
+    ]
+    return pytest.mark.parametrize(("case", "channels"), rows)
 
 
 def seeded(module: Callable[..., Any], *inputs: Any, seed: int = 0, **arguments: Any) -> Any:

@@ -839,7 +839,7 @@ def each_border_once() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("border", "strips", "held"), list(each_border_once()))
-@pytest.mark.parametrize("factors", [None, 5])
+@pytest.mark.parametrize("factors", [pytest.param(None, marks=pytest.mark.slow), 5])
 @pytest.mark.parametrize(
     "bands", [pytest.param(3, id="in parts"), pytest.param(1000, id="at once", marks=pytest.mark.slow)]
 )

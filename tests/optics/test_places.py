@@ -77,10 +77,10 @@ def test_openings_between_wavelengths_are_those_of_their_own_edges() -> None:
 
 
 def test_psfs_of_many_wavelengths_are_those_of_each() -> None:
-    lens = optics.CompoundLens.preset("ef50", focus_distance=5.0)
+    lens = optics.CompoundLens.preset("cooke_triplet", focus_distance=5.0)
     wavelengths = [(430 + 20 * k) * nm for k in range(14)]
     how = {"distances": 5.0, "pixel_pitch": 8 * um, "shape": (33, 33), "field": torch.tensor([[0.05, 0.2]])}
     together = lens.psf(wavelengths, **how)
-    for index in (0, 5, 9, 13):
+    for index in (0, 9):
         alone = lens.psf(wavelengths[index : index + 1], **how)
         assert float((together[:, :, index] - alone[:, :, 0]).abs().sum()) < 1e-3 * float(alone.sum())
