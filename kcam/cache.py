@@ -200,7 +200,7 @@ class ValueCache:
                 return kept[2]  # type: ignore[no-any-return]
         before = tuple(tensor.detach().clone() for tensor in tensors)
         value = build()
-        if not _has_derivative(value):
+        if not has_derivative(value):
             self._kept = ((key, before, value), *self._kept)[: self.entries]
         return value
 
@@ -209,7 +209,7 @@ class ValueCache:
         return ValueCache, (self.entries,)
 
 
-def _has_derivative(value: Any) -> bool:
+def has_derivative(value: Any) -> bool:
     """Whether a derivative passes through a result, or might."""
     tensors: list[Tensor] = []
     try:

@@ -170,9 +170,10 @@ def test_no_print_no_assert_no_bare_raise(path: Path) -> None:
     [
         "import kcam, kcam.augmentation, kcam.data, kcam.style",
         "import kcam; kcam.Camera.phone()(kcam.Scene.builtin('star', 32))",
+        "import kcam; kcam.Camera.preset('slr')[0](kcam.Scene.builtin('star', 32))",
         "import kcam.augmentation as KC, torch; KC.RandomDefocus(p=1.0)(torch.rand(1, 3, 24, 24))",
     ],
-    ids=["import", "picture", "augmentation"],
+    ids=["import", "picture", "picture over the field", "augmentation"],
 )
 def test_nothing_that_is_not_compiled_waits_for_the_compiler(code: str) -> None:
     """torch._dynamo takes 2 s to import, and torch.compiler's own decorators do so."""

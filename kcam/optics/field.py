@@ -226,10 +226,10 @@ class FieldPicture:
         extended = extend(planes, self.pixels.shape, self.border)
         around = None if shares is None else extend(shares, self.pixels.shape, self.border)
         patches = []
-        for row, column in zip(*(index.tolist() for index in torch.unravel_index(most, detail.shape)), strict=True):
+        for at in most.tolist():
+            place = divmod(at, detail.shape[1])  # row and column
             places = [
-                slice(k * _PATCH, (k + 1) * _PATCH + m - 1)
-                for k, m in zip((row, column), self.pixels.shape, strict=True)
+                slice(k * _PATCH, (k + 1) * _PATCH + m - 1) for k, m in zip(place, self.pixels.shape, strict=True)
             ]
             patches.append([None if part is None else part[..., places[0], places[1]] for part in (extended, around)])
         cells = [torch.tensor([cell], dtype=torch.float64) for cell in _CELLS]

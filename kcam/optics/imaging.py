@@ -16,7 +16,7 @@ from typing import Any, Protocol, Unpack
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, differentiated
+from kcam.cache import ValueCache, differentiated, has_derivative
 from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
@@ -474,8 +474,11 @@ class Imaging(Stage):
             weights, afterwards = None, weights
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         if self.varies:
-            field = self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes)
-            return self._finished(field.light(planes, shares), weights, afterwards)
+            learns = has_derivative((self.lens, planes, shares, spectra, vergences, weights))
+            with torch.set_grad_enabled(learns and torch.is_grad_enabled()):  # else nothing is to be kept for it
+                field = self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes)
+                light = field.light(planes, shares)
+            return self._finished(light, weights, afterwards)
         length = self._layers_at_once(bands, window, planes)
         light = planes.new_zeros(())
         for position, own in self._zones(planes):

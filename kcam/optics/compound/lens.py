@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDEST, _INTERVALS, _NESTED = 60.0, 16, 4  # degrees; of a search for the edge of the field
-_AIMING = 10  # steps of the secant that aims a chief ray
+_AIMING = 10  # steps of the secant that aims a chief ray, at most
+_AIMED = 1e-11  # of the entrance pupil: a last Newton step squares what is left
+_STEP = 1e-3  # of differences in the entrance pupil, of that
 _AIMING_EACH = 60  # at most, of a ray to its point of the stop: a phone's, on a steep stop, takes some 40
 
 
@@ -213,7 +215,7 @@ class CompoundLens(nn.Module):
         follow those of the entrance pupil there; shape of what broadcasts.
         """
         first = self.first_order()
-        step = 1e-3 * first.entrance_semi_diameter.detach()
+        step = _STEP * first.entrance_semi_diameter.detach()
 
         def landed(px: Tensor, py: Tensor) -> Rays:
             return trace(
@@ -223,8 +225,7 @@ class CompoundLens(nn.Module):
                 until=self.stop,
             )
 
-        shape = torch.broadcast_shapes(heights.shape, vergences.shape, *(index.shape for index in indices))
-        zero = torch.zeros(shape, dtype=torch.float64, device=heights.device)
+        zero = torch.zeros_like(torch.broadcast_tensors(heights, vergences, *indices)[0])
         with torch.no_grad():
             before, now = zero, zero + step
             low, high = (landed(zero, at).y for at in (before, now))
@@ -233,6 +234,8 @@ class CompoundLens(nn.Module):
                 slope = torch.where(slope.abs() < 1e-6, 1.0, slope)
                 before, low, now = now, high, now - high / slope
                 high = landed(zero, now).y
+                if bool((high.abs() < _AIMED * step / _STEP).all()):
+                    break
             along = (landed(zero, now + step).y - high) / step
             across = landed(zero + step, now).x / step
         return now - landed(zero, now).y / along, across, along
@@ -458,7 +461,9 @@ class CompoundLens(nn.Module):
             highest = reach / scale
             try:
                 for _ in range(_AIMING):  # the image of the highest point lies at the sensor's corner
-                    highest = highest * reach / landed(highest[None])[0]
+                    before, highest = highest, highest * reach / landed(highest[None])[0]
+                    if bool((highest / before - 1).abs() < 1e-4):
+                        break
                 highest = 1.005 * highest
                 landed(highest[None])
             except ValueError as error:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from kcam.cache import ValueCache
+from kcam.cache import ValueCache, has_derivative
 from kcam.optics.rendering.borders import extend
 from kcam.optics.rendering.contraction import contract
 from kcam.optics.rendering.convolution import Convolution, correlate
@@ -155,8 +155,10 @@ def _each(bank: Bank, psfs: Tensor) -> Blur:
 
     def blur(planes: Tensor) -> Tensor:
         of_bands = bank.of_bands(psfs)
-        # between the forward and the backward pass only the results are kept, not 28 spectra
-        run = functools.partial(checkpoint, band, use_reentrant=False) if torch.is_grad_enabled() else band
+        run: Callable[..., Tensor] = band
+        if torch.is_grad_enabled() and has_derivative((planes, psfs, spectra)):
+            # between the forward and the backward pass only the results are kept, not 28 spectra
+            run = functools.partial(checkpoint, band, use_reentrant=False)
         return torch.stack([run(planes, of_bands[index], index) for index in range(bank.bands)], dim=1)
 
     return direct if bank.direct else blur
