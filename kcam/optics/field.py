@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 
 from kcam.optics.rendering.borders import extend
-from kcam.optics.rendering.places import Bank, Between, grid
+from kcam.optics.rendering.places import Bank, Between
 from kcam.optics.rendering.resampling import Resampling, resampling, smooth_map
 from kcam.optics.rendering.zones import Axis, blend
 from kcam.optics.source import FieldPSFs, PixelGrid
 
-ALLOWED = 1.5e-3
-"""Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]."""
-BETWEEN = 0.7  # of that, what PSFs between those that are computed may leave, at most
+ALLOWED = 3e-3
+"""Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]. It is an
+upper bound, of which pictures show a third or less."""
+BETWEEN = 0.75  # of that, what PSFs between those that are computed may leave, at most
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
 PROBE = 128  # pixels between the places that are tried
@@ -73,13 +74,14 @@ class FieldEstimate:
 
 @dataclass(frozen=True)
 class _How:
-    """Pixels between nodes, and the error that this leaves; pixels between PSFs that are computed, where that is not
-    done at each node, and the error that this leaves.
+    """Pixels between nodes, and the error that this leaves; the PSFs that are computed, where nodes have theirs from
+    fewer places: how often the distance of these was halved, and the error that they leave.
     """
 
     apart: float
     blending: float = 0.0
-    known: float | None = None
+    known: Between | None = None
+    halvings: int = 0
     between: float = 0.0
 
 
@@ -108,10 +110,10 @@ class FieldPicture:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
         planes, shares = self.moved(planes, shares)
         how = self.how(planes, shares)
-        between = self.bank if how.known is None else self.between(planes, apart=how.known)
-        return blend(
-            planes, shares, between, self.render, window=self.pixels.shape, apart=how.apart, border=self.border
-        )
+        bank: Bank = how.known or self.bank
+        if how.known is not None and torch.is_grad_enabled():
+            bank = self._known(planes, halvings=how.halvings)
+        return blend(planes, shares, bank, self.render, window=self.pixels.shape, apart=how.apart, border=self.border)
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Where distortion brings them, planes times the relative illumination there: nodes share out what is left."""
@@ -146,7 +148,7 @@ class FieldPicture:
                 sides = zip(picture, self.pixels.shape, strict=True)
                 rows, columns = (len(Axis.of(n, m, apart=how.apart).nodes) for n, m in sides)
             else:
-                rows, columns = (len(grid(n, apart=how.known)) for n in picture)
+                rows, columns = len(how.known.rows), len(how.known.columns)
             apart, blending = how.apart, how.blending
             if self.spacing is not None and math.isinf(self.spacing):  # one PSF on purpose
                 apart = max(picture)
@@ -162,9 +164,12 @@ class FieldPicture:
     def _on_sensor(self, places: Tensor) -> Tensor:
         return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
 
-    def between(self, planes: Tensor, *, apart: float) -> Between:
-        """PSFs of all places, from those of some."""
-        return Between.known(self.bank, (planes.shape[-2], planes.shape[-1]), apart=apart)
+    def _known(self, planes: Tensor, *, halvings: int) -> Between:
+        sides = (planes.shape[-2], planes.shape[-1])
+        known = Between.known(self.bank, sides, apart=2.0 * _probe(sides))
+        for _ in range(halvings):
+            known = known.refined(self.bank)
+        return known
 
     @torch.no_grad()
     def how(self, planes: Tensor, shares: Tensor | None) -> _How:
@@ -172,27 +177,20 @@ class FieldPicture:
         if self.spacing is not None:
             return _How(self.spacing)
         sides = (planes.shape[-2], planes.shape[-1])
-        probe = max(2, min(PROBE, max(sides) // 2))
-        known, apart, error = 2.0 * probe, _FINEST, math.inf
-        while known > apart:
-            if self._held(sides, known) > self.most:
-                break
-            between = self.between(planes, apart=known)
+        probe = _probe(sides)
+        known, halvings = self._known(planes, halvings=0), 0
+        while True:
             off, error = self._left(
-                planes, shares, [self._interpolated(between, sides), self._blended(between, sides, probe)]
+                planes, shares, [self._interpolated(known, sides), self._blended(known, sides, probe)]
             )
-            apart, error = _apart(error, probe, allowed=ALLOWED - min(off, BETWEEN * ALLOWED))
+            apart, error = _apart(error, probe, allowed=math.sqrt(ALLOWED**2 - min(off, BETWEEN * ALLOWED) ** 2))
             if off <= BETWEEN * ALLOWED:
-                return _How(apart, error, known, off)
-            known /= 2
+                return _How(apart, error, known, halvings, off)
+            if probe / 2**halvings < apart or 4 * known.psfs.nbytes > self.most:
+                break
+            known, halvings = known.refined(self.bank), halvings + 1
         apart, error = _apart(self._left(planes, shares, [self._blended(self.bank, sides, probe)])[0], probe)
         return _How(apart, error)
-
-    def _held(self, sides: tuple[int, int], known: float) -> float:
-        """Bytes of the PSFs that are known."""
-        places = math.prod(len(grid(n, apart=known)) for n in sides)
-        psf = self.bank(torch.zeros(1, 2, dtype=torch.float64))
-        return float(places * psf.nbytes)
 
     def _blended(self, bank: Bank, sides: tuple[int, int], apart: float) -> Bank:
         """What windows between nodes so far apart are off by, in the middle of a cell at parts (1, 2) of a quadrant."""
@@ -252,13 +250,19 @@ class FieldPicture:
         return found
 
 
+def _probe(sides: tuple[int, int]) -> int:
+    """Pixels between places that are tried."""
+    return max(2, min(PROBE, max(sides) // 2))
+
+
 def _last(sides: tuple[int, int]) -> Tensor:
     return torch.tensor([sides[1] - 1, sides[0] - 1], dtype=torch.float64) / 2
 
 
 def _apart(error: float, probe: float, *, allowed: float = ALLOWED) -> tuple[int, float]:
     """How many pixels nodes may lie apart, and the error that this leaves, from that of nodes `probe` apart."""
-    steps = [2**k for k in range(int(math.log2(_FINEST)), int(math.log2(_COARSEST)) + 1)]
+    halves = range(round(2 * math.log2(_FINEST)), round(2 * math.log2(_COARSEST)) + 1)
+    steps = [round(2 ** (k / 2)) for k in halves]
     fine = [step for step in steps if error * (step / probe) ** 2 <= allowed] or [_FINEST]
     return fine[-1], error * (fine[-1] / probe) ** 2
 

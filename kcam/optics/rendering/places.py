@@ -28,16 +28,15 @@ class Between:
 
     @classmethod
     def known(cls, bank: Bank, picture: tuple[int, int], *, apart: float) -> Between:
-        """PSFs at most so many pixels apart. Where gradients are asked for, they are computed again on the way back."""
+        """PSFs at most so many pixels apart."""
         rows, columns = (grid(n, apart=apart) for n in picture)
-        count = len(rows)
-        found: dict[int, Tensor] = {}
-        for first in range((count + 1) // 2):  # rows that mirror each other: their PSFs too, where optics are centred
-            pair = sorted({first, count - 1 - first})
-            places = torch.cartesian_prod(rows[pair], columns).flip(1)
-            psfs = checkpoint(bank, places, use_reentrant=False) if torch.is_grad_enabled() else bank(places)
-            found |= dict(zip(pair, psfs.unflatten(0, (len(pair), -1)), strict=True))
-        return cls(rows, columns, torch.stack([found[row] for row in range(count)]))
+        return cls(rows, columns, _computed(bank, rows, columns))
+
+    def refined(self, bank: Bank) -> Between:
+        """With those in the middle between them too."""
+        rows, columns = halved(self.rows), halved(self.columns)
+        upper = _woven(self.psfs, _computed(bank, self.rows, columns[1::2]), dim=1)
+        return Between(rows, columns, _woven(upper, _computed(bank, rows[1::2], columns), dim=0))
 
     def middle(self, place: Tensor) -> Tensor:
         """Of the cell around a place (1, 2)."""
@@ -66,6 +65,33 @@ def grid(n: int, *, apart: float) -> Tensor:
         return torch.zeros(1, dtype=torch.float64)
     count = max(_POINTS, 1 + math.ceil((n - 1) / apart))
     return torch.linspace(-(n - 1) / 2, (n - 1) / 2, count, dtype=torch.float64)
+
+
+def halved(nodes: Tensor) -> Tensor:
+    """Even nodes, and the middles between them."""
+    return _woven(nodes, (nodes[1:] + nodes[:-1]) / 2, dim=0)
+
+
+def _woven(own: Tensor, between: Tensor, *, dim: int) -> Tensor:
+    """n tensors along a dimension, and n - 1 between them."""
+    if own.shape[dim] == 1:
+        return own
+    pairs = torch.stack([own.narrow(dim, 0, between.shape[dim]), between], dim + 1).flatten(dim, dim + 1)
+    return torch.cat([pairs, own.narrow(dim, -1, 1)], dim)
+
+
+def _computed(bank: Bank, rows: Tensor, columns: Tensor) -> Tensor:
+    """PSFs (Y, X, ...), none of no places. Where gradients are asked for, they are computed again on the way back."""
+    if not len(rows) * len(columns):
+        return rows.new_empty(0)
+    count = len(rows)
+    found: dict[int, Tensor] = {}
+    for first in range((count + 1) // 2):
+        pair = sorted({first, count - 1 - first})  # rows mirror each other: their PSFs too, where optics are centred
+        places = torch.cartesian_prod(rows[pair], columns).flip(1)
+        psfs = checkpoint(bank, places, use_reentrant=False) if torch.is_grad_enabled() else bank(places)
+        found |= dict(zip(pair, psfs.unflatten(0, (len(pair), -1)), strict=True))
+    return torch.stack([found[row] for row in range(count)])
 
 
 def cubic_weights(nodes: Tensor, at: Tensor) -> Tensor:
