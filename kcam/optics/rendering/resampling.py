@@ -107,13 +107,13 @@ def _means_of(planes: Tensor, edges: Tensor, border: str) -> Tensor:
     with torch.no_grad():
         first = (start + 0.5).floor()
         count = int(((stop + 0.5).ceil() - first).max())
+    start, stop, first = (start - first).to(planes), (stop - first).to(planes), first.long()
     width = stop - start
     result = planes.new_zeros(())
     for step in range(count):
-        pixel = first + step
-        overlap = torch.minimum(stop, pixel + 0.5) - torch.maximum(start, pixel - 0.5)
-        share = (overlap.clamp(min=0) / width).to(planes)
-        index = border_index(pixel.long(), planes.shape[-1], border) if border != "zero" else pixel.long()
+        share = (stop.clamp(max=step + 0.5) - start.clamp(min=step - 0.5)).clamp(min=0) / width
+        index = first + step
+        index = border_index(index, planes.shape[-1], border) if border != "zero" else index
         if border == "zero":
             share = torch.where((index >= 0) & (index < planes.shape[-1]), share, 0)
             index = index.clamp(0, planes.shape[-1] - 1)
