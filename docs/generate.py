@@ -853,7 +853,11 @@ def lens_gallery(path: Path) -> None:
     sys.path.insert(0, str(ROOT / "examples"))
     import lens_gallery as example
 
-    save_jpeg(example.figure({name: example.pictures_of(name) for name in example.PRESETS}), path, resolutions=(150,))
+    save_jpeg(
+        example.figure({name: example.pictures_of(name) for name in example.PRESETS}),
+        path,
+        resolutions=(150, 140, 130, 120),
+    )
 
 
 def augmentation_gallery(path: Path) -> None:
