@@ -298,7 +298,7 @@ def seconds_text(seconds: float) -> str:
 def field_picture(path: Path) -> None:
     """How the time of a picture grows with its pixels, and with the places whose PSFs are made."""
     rows = json.loads(FIELD.read_text())["rows"]
-    sheet = plots.Sheet(9.6, 4.4)
+    sheet = plots.Sheet(9.6, 4.75)
     sheet.text(0.8, 0.2, "Pictures over the field: how their time grows", size=plots.TITLE, weight="bold")
     sheet.text(
         0.8, 0.52, "one thread; the whole sensor on so many pixels, or PSFs at so many places", colour=plots.MUTED
@@ -320,9 +320,9 @@ def field_picture(path: Path) -> None:
                 start, end = max(zip(x, (row["first"] for row in own), strict=True)), min(x)
                 axes.plot([end, start[0]], [start[1] * end / start[0], start[1]], ":", color=plots.MUTED, lw=1)
     for index, (camera, colour) in enumerate(FIELD_COLOURS.items()):
-        sheet.text(0.8 + 1.5 * index, 4.1, "\u25cf", colour=colour, size=plots.LABEL)
-        sheet.text(0.98 + 1.5 * index, 4.1, camera, size=plots.LABEL)
-    sheet.text(3.9, 4.12, "solid: first picture; dashed: second; dotted: linear", size=plots.SMALL, colour=plots.MUTED)
+        sheet.text(0.8 + 1.5 * index, 4.4, "\u25cf", colour=colour, size=plots.LABEL)
+        sheet.text(0.98 + 1.5 * index, 4.4, camera, size=plots.LABEL)
+    sheet.text(3.9, 4.42, "solid: first picture; dashed: second; dotted: linear", size=plots.SMALL, colour=plots.MUTED)
     save_plot(sheet.figure, path, source=FIELD)
 
 
