@@ -49,7 +49,7 @@ PARTS = ("pictures", "methods", "growth", "gradient")
 PATCHES, PLACES, EIGEN = 7, 5, 5
 FINE = 16  # pixels between PSFs of the truth
 CROPS = ((0.5, 0.5), (0.3, 0.68), (0.12, 0.45), (0.0, 0.0))  # shares of height and width: the last is a corner
-DENSEST = 56  # pixels across, that each get a PSF: what reaches the crop
+DENSEST = 40  # pixels across, that each get a PSF: what reaches the crop
 SQUARE = 1024  # what baselines convolve at once [pixels]
 PATIENCE = 300.0  # seconds that a picture with its gradient may be expected to take
 
@@ -66,7 +66,7 @@ class Sizes:
     grown: float = 1
     spacings: tuple[int, ...] = (512, 256, 128, 64, 32)
     crop: int = 96
-    dense: int = 16
+    dense: int = 8
     cropped: bool = False
 
 

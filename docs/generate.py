@@ -1,7 +1,7 @@
 """What the README shows and nobody should type: its tables, what its code prints, and its pictures.
 
     python docs/generate.py               writes the tables, and what the code blocks print
-    python docs/generate.py --pictures    renders the pictures too: a minute
+    python docs/generate.py --pictures    renders the pictures too: a quarter of an hour, most of it docs/lenses.jpg
     python docs/generate.py --traps       runs the traps of tests/stability first: ten seconds
     python docs/generate.py --check       changes nothing; says what is out of step
 
@@ -250,6 +250,80 @@ def peers_picture(path: Path) -> None:
     sheet.text(7.65, 2.7, "round: float32", size=plots.SMALL, colour=plots.MUTED)
     sheet.text(7.65, 2.92, "square: float64", size=plots.SMALL, colour=plots.MUTED)
     save_plot(sheet.figure, path, source=source)
+
+
+# ---- pictures over the field -----------------------------------------------------------------------------------------
+
+FIELD = RESULTS / "field.json"
+FIELD_COLOURS = {"slr": "#3f6fd8", "phone_lens": "#c98a00"}
+
+
+def field_table() -> str:
+    """Pictures of both cameras by kcam and as others make them: time, memory, PSNR; one table for each camera."""
+    content = json.loads(FIELD.read_text())
+    rows = [row for row in content["rows"] if row["part"] in ("methods", "gradient", "pictures")]
+    compared = {(row["camera"], row["megapixels"]) for row in rows if row["part"] == "methods"}
+    lines = [
+        "| camera, megapixels | | places | first | second | memory | PSNR, worst crop |",
+        "|---|---|---:|---:|---:|---:|---:|",
+    ]
+    shown = set()
+    for row in sorted(rows, key=lambda row: (row["camera"] != "slr", row["megapixels"])):
+        if row["part"] == "pictures" and (row["camera"], row["megapixels"]) in compared:  # measured there again
+            continue
+        first = f"`{row['camera']}`, {figures(row['megapixels'])}"
+        title, shown = ("" if first in shown else first), shown | {first}
+        who = row["who"] + (", a star field" if row["scene"] == "stars" else "")
+        times = [seconds_text(row[name]) if name in row else "" for name in ("first", "second")]
+        memory = f"{figures(row['peak_memory'] / 1e6)} MB" if row.get("peak_memory") is not None else ""
+        quality = f"{row['psnr']:.0f} dB" if "psnr" in row else row.get("skipped", "")
+        quality += f", {row['psnr_worst']:.0f}" if "psnr_worst" in row else ""
+        places = " x ".join(map(str, row.get("places", ())))
+        lines.append(f"| {title} | {who} | {places} | {' | '.join(times)} | {memory} | {quality} |")
+    environment = content["environment"]
+    lines += [
+        "",
+        f"<sub>[`{FIELD.name}`]({FIELD.relative_to(ROOT)}): {environment['machine']}, {environment['threads']} thread, "
+        f"torch {environment['versions']['torch']}, {environment['date'][:10]}; CPU seconds of one thread, once each. "
+        "Memory is the peak beyond what was in use before.</sub>",
+    ]
+    return "\n".join(lines)
+
+
+def seconds_text(seconds: float) -> str:
+    """A time in a table."""
+    return f"{figures(seconds * 1e3)} ms" if seconds < 1 else f"{figures(seconds)} s"
+
+
+def field_picture(path: Path) -> None:
+    """How the time of a picture grows with its pixels, and with the places whose PSFs are made."""
+    rows = json.loads(FIELD.read_text())["rows"]
+    sheet = plots.Sheet(9.6, 4.75)
+    sheet.text(0.8, 0.2, "Pictures over the field: how their time grows", size=plots.TITLE, weight="bold")
+    sheet.text(
+        0.8, 0.52, "one thread; the whole sensor on so many pixels, or PSFs at so many places", colour=plots.MUTED
+    )
+    for column, (part, what) in enumerate((("pictures", "megapixels"), ("growth", "places"))):
+        axes = sheet.axes(0.8 + 4.5 * column, 0.95, 3.6, 2.8)
+        axes.set(xscale="log", yscale="log", xlabel=what, ylabel="CPU seconds")
+        axes.grid(color=plots.FAINT, lw=0.7)
+        axes.spines[["top", "right"]].set_visible(False)
+        for camera, colour in FIELD_COLOURS.items():
+            own = [row for row in rows if row["part"] == part and row["camera"] == camera]
+            if not own:
+                continue
+            x = [row["megapixels"] if part == "pictures" else math.prod(row["places"]) for row in own]
+            for which, style in (("first", "-"), ("second", "--")):
+                y = [row[which] for row in own]
+                axes.plot(*zip(*sorted(zip(x, y, strict=True)), strict=True), style, color=colour, marker="o", ms=5)
+            if camera == "slr":  # what is linear has this slope
+                start, end = max(zip(x, (row["first"] for row in own), strict=True)), min(x)
+                axes.plot([end, start[0]], [start[1] * end / start[0], start[1]], ":", color=plots.MUTED, lw=1)
+    for index, (camera, colour) in enumerate(FIELD_COLOURS.items()):
+        sheet.text(0.8 + 1.5 * index, 4.4, "\u25cf", colour=colour, size=plots.LABEL)
+        sheet.text(0.98 + 1.5 * index, 4.4, camera, size=plots.LABEL)
+    sheet.text(3.9, 4.42, "solid: first picture; dashed: second; dotted: linear", size=plots.SMALL, colour=plots.MUTED)
+    save_plot(sheet.figure, path, source=FIELD)
 
 
 # ---- plans -----------------------------------------------------------------------------------------------------------
@@ -642,6 +716,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "plans": plans_table,
     "honesty": honesty_table,
     "training": training_table,
+    "field": field_table,
     "benchmarks": benchmarks_table,
     "augmentations": augmentations_table,
     "augmentation_speed": augmentation_speed_table,
@@ -773,6 +848,18 @@ def gallery(path: Path) -> None:
     save_jpeg(psf_gallery.figure(psf_gallery.gallery()), path)
 
 
+def lens_gallery(path: Path) -> None:
+    """What examples/lens_gallery.py draws."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    import lens_gallery as example
+
+    save_jpeg(
+        example.figure({name: example.pictures_of(name) for name in example.PRESETS}),
+        path,
+        resolutions=(150, 140, 130, 120),
+    )
+
+
 def augmentation_gallery(path: Path) -> None:
     """What examples/augmentation_gallery.py draws."""
     sys.path.insert(0, str(ROOT / "examples"))
@@ -781,7 +868,9 @@ def augmentation_gallery(path: Path) -> None:
     save_jpeg(example.figure(example.gallery(), example.original()[0]), path, resolutions=(165,))  # noise is bulky
 
 
-PLOTS = {"peers.png": RESULTS / "peers.json"} | {f"tradeoff-{name}.png": path for name, path in SWEEPS.items()}
+PLOTS = {"peers.png": RESULTS / "peers.json", "field-growth.png": FIELD} | {
+    f"tradeoff-{name}.png": path for name, path in SWEEPS.items()
+}
 """Plot -> the results that it shows."""
 
 PICTURES: dict[str, Callable[[Path], None]] = {
@@ -791,6 +880,8 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "tradeoff-singlet.png": tradeoff_picture,
     "tradeoff-thesis.png": tradeoff_picture,
     "peers.png": peers_picture,
+    "field-growth.png": field_picture,
+    "lenses.jpg": lens_gallery,
     "plans.jpg": plans_picture,
     "contact_sheet.jpg": contact_sheet,
 }

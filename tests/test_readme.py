@@ -32,11 +32,12 @@ EXAMPLES = {
     "train_lens": ["--steps", "2", "--out", "lens.png"],
     "compose_camera": ["--size", "40", "--out", "cameras.png"],
     "psf_gallery": ["--pixels", "21", "--out", "gallery.png"],
+    "lens_gallery": ["--lenses", "tessar", "--across", "1000", "--out", "lenses.png"],
     "augmentation_gallery": ["--side", "40", "--out", "augmentations.png"],
     "train_segmentation": ["--quick", "--out", "training.json"],
     "plan_scenes": ["--size", "40", "--out", "plans"],
 }
-SLOW = ("plan_scenes", "train_lens", "augmentation_gallery")
+SLOW = ("plan_scenes", "train_lens", "lens_gallery", "augmentation_gallery")
 
 
 def load(path: Path) -> ModuleType:
