@@ -424,8 +424,15 @@ def test_light_that_nobody_sees_is_white() -> None:
     assert plots.light_colours(torch.tensor([5500.0]) * nm).tolist() == [[1, 1, 1]]
 
 
-@pytest.mark.parametrize("distances", [[1.0], [0.5, 2.0, math.inf]])
-@pytest.mark.parametrize("wavelengths", [[550 * nm], [450 * nm, 650 * nm, 5500 * nm]])
+@pytest.mark.parametrize(
+    ("distances", "wavelengths"),
+    [
+        ([0.5, 2.0, math.inf], [450 * nm, 650 * nm, 5500 * nm]),
+        pytest.param([1.0], [550 * nm], marks=pytest.mark.slow),
+        pytest.param([1.0], [450 * nm, 650 * nm, 5500 * nm], marks=pytest.mark.slow),
+        pytest.param([0.5, 2.0, math.inf], [550 * nm], marks=pytest.mark.slow),
+    ],
+)
 def test_all_text_of_a_psf_figure_is_inside_it(distances: list[float], wavelengths: list[float]) -> None:
     imaging = Camera.phone()[0]
     with torch.no_grad():

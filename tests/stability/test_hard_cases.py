@@ -7,7 +7,11 @@ import torch
 from cases import BAD_CASES, CASES, ITEMS, NAMES
 from contract import DOUBLE, SINGLE, BadCase, Case, photograph, relative
 
-ROWS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow else []) for case in CASES]
+QUICK = 2  # of so many cases, one runs among the quick tests
+ROWS = [
+    pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow or index % QUICK else [])
+    for index, case in enumerate(CASES)
+]
 
 
 @pytest.mark.parametrize("case", ROWS)
