@@ -8,15 +8,15 @@ those parts of the picture that hold most of its detail.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from kcam.optics.rendering.borders import extend
+from kcam.optics.rendering.borders import part
 from kcam.optics.rendering.places import Bank, Between
-from kcam.optics.rendering.resampling import Resampling, resampling, smooth_map
+from kcam.optics.rendering.resampling import Resampling, multiplied, resampling
 from kcam.optics.rendering.zones import Axis, blend
 from kcam.optics.source import FieldPSFs, PixelGrid
 
@@ -110,9 +110,10 @@ class FieldPicture:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
         planes, shares = self.moved(planes, shares)
         how = self.how(planes, shares)
-        bank: Bank = how.known or self.bank
-        if how.known is not None and torch.is_grad_enabled():
-            bank = self._known(planes, halvings=how.halvings)
+        bank: Callable[[Tensor], Iterable[Tensor]] = self.bank
+        if how.known is not None:
+            known = self._known(planes, halvings=how.halvings) if torch.is_grad_enabled() else how.known
+            bank = known.each
         return blend(planes, shares, bank, self.render, window=self.pixels.shape, apart=how.apart, border=self.border)
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -121,8 +122,7 @@ class FieldPicture:
         moves = self.distortion(picture)
         if moves is not None:
             planes, shares = moves(planes), None if shares is None else moves(shares)
-        light = smooth_map(lambda places: self.psfs.illumination(self._on_sensor(places)), picture)
-        return planes * light.to(planes), shares
+        return multiplied(planes, lambda places: self.psfs.illumination(self._on_sensor(places))), shares
 
     def distortion(self, picture: tuple[int, int]) -> Resampling | None:
         """From the scene's pixels to the picture's; None where nothing moves."""
@@ -213,6 +213,13 @@ class FieldPicture:
 
         return off
 
+    def _patch(self, planes: Tensor, place: tuple[int, int]) -> Tensor:
+        """One of the patches, row and column, with as much around it as the window reaches."""
+        for dim, index, m in zip((-2, -1), place, self.pixels.shape, strict=True):
+            start, stop = index * _PATCH, min((index + 1) * _PATCH, planes.shape[dim])
+            planes = part(planes, start - m // 2, stop + (m - 1) // 2, self.border, dim=dim)
+        return planes
+
     @torch.no_grad()
     def _left(self, planes: Tensor, shares: Tensor | None, deviations: list[Bank]) -> list[float]:
         """Of the light where PSFs deviate so from what they should be, rms, relative: in the worst of some cells, on
@@ -221,15 +228,10 @@ class FieldPicture:
         height, width = planes.shape[-2:]
         detail = _detail(planes)
         most = detail.flatten().argsort(descending=True)[:_PATCHES]
-        extended = extend(planes, self.pixels.shape, self.border)
-        around = None if shares is None else extend(shares, self.pixels.shape, self.border)
-        patches = []
-        for at in most.tolist():
-            place = divmod(at, detail.shape[1])  # row and column
-            places = [
-                slice(k * _PATCH, (k + 1) * _PATCH + m - 1) for k, m in zip(place, self.pixels.shape, strict=True)
-            ]
-            patches.append([None if part is None else part[..., places[0], places[1]] for part in (extended, around)])
+        patches = [
+            [None if own is None else self._patch(own, divmod(at, detail.shape[1])) for own in (planes, shares)]
+            for at in most.tolist()
+        ]
         cells = [torch.tensor([cell], dtype=torch.float64) for cell in _CELLS]
         weight = float(detail.sum() / detail.flatten()[most].sum().clamp(min=1e-300))
         step = max(1, math.isqrt(height * width // _SAMPLED))
@@ -242,8 +244,8 @@ class FieldPicture:
             for cell in cells:
                 off, squares = deviation(cell)[0], 0.0
                 uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
-                for own, part in patches:
-                    seen = self.render(off, own, part, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
+                for own, around in patches:
+                    seen = self.render(off, own, around, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
                     squares += float(seen.double().square().sum())
                 worst = max(worst, squares)
             found.append(math.sqrt(worst * weight / max(float(light), 1e-300) + uneven**2))
@@ -261,8 +263,8 @@ def _last(sides: tuple[int, int]) -> Tensor:
 
 def _apart(error: float, probe: float, *, allowed: float = ALLOWED) -> tuple[int, float]:
     """How many pixels nodes may lie apart, and the error that this leaves, from that of nodes `probe` apart."""
-    halves = range(round(2 * math.log2(_FINEST)), round(2 * math.log2(_COARSEST)) + 1)
-    steps = [round(2 ** (k / 2)) for k in halves]
+    eighths = range(round(8 * math.log2(_FINEST)), round(8 * math.log2(_COARSEST)) + 1)
+    steps = [round(2 ** (k / 8)) for k in eighths]
     fine = [step for step in steps if error * (step / probe) ** 2 <= allowed] or [_FINEST]
     return fine[-1], error * (fine[-1] / probe) ** 2
 

@@ -438,7 +438,8 @@ class Imaging(Stage):
         ]
         shaped = functools.partial(planes.new_empty, device="meta")
         factored = scene.spectra is not None or count < planes.shape[1]
-        rendering = self._rendering(scene) | {"border": "zero", "picture": (sides[0], sides[1]), "cache": None}
+        border = "dark" if layers == 1 else "zero"
+        rendering = self._rendering(scene) | {"border": border, "picture": (sides[0], sides[1]), "cache": None}
         renderer = Renderer(
             shaped(1, groups, *window),
             spectra=shaped(count, bands) if factored else None,
@@ -565,8 +566,15 @@ class Imaging(Stage):
                 rendering |= {"spectra": of_plane.to(like), "weights": of_channel.to(like), "owner": None}
         psfs = self._over_field(picture, vergences, scene.wavelengths)
 
-        def render(bank: Tensor, planes: Tensor, shares: Tensor | None, *, occlusion: bool | None = None) -> Tensor:
-            own = rendering | {"picture": (planes.shape[-2], planes.shape[-1])}
+        def render(
+            bank: Tensor,
+            planes: Tensor,
+            shares: Tensor | None,
+            *,
+            occlusion: bool | None = None,
+            border: str = "zero",
+        ) -> Tensor:
+            own = rendering | {"picture": (planes.shape[-2], planes.shape[-1]), "border": border}
             layers = Layers(planes, shares, occlusion=self.accuracy.occlusion if occlusion is None else occlusion)
             layers.add(Renderer(bank, **own), first=0)
             return layers.light

@@ -16,7 +16,7 @@ from kcam.optics.compound.pupil import PupilFit
 from kcam.optics.compound.table import PupilTable
 from kcam.optics.source import PixelGrid
 
-_LOOKED = 9  # heights at which a window is asked for
+_LOOKED, _COLOURS = 9, 5  # heights and wavelengths at which a window is asked for
 _FEWEST = 64  # samples along a pupil
 
 
@@ -161,17 +161,23 @@ class FieldPSFs:
         `Lens.window`; of each ray that falls x from the middle, what lies beyond r - x.
         """
         slopes, area = self._spread
-        colours = self.wavelengths.repeat(len(slopes) // len(self.wavelengths))
+        colours = self._looked.repeat(len(slopes) // len(self._looked))
         # the rim of an area is that of a disc at least: 2 sqrt(pi area)
         tail = (colours * (math.pi / area).sqrt() / math.pi**2)[:, None]
         side = window_side(slopes, tail, pitch=pixels.pitch)
         return side, side
 
+    @property
+    def _looked(self) -> Tensor:
+        """Wavelengths at which a window is asked for: some of them, the shortest and the longest too."""
+        index = torch.linspace(0, len(self.wavelengths) - 1, min(_COLOURS, len(self.wavelengths))).round().long()
+        return self.wavelengths.sort().values[index]
+
     @functools.cached_property
     def _spread(self) -> tuple[Tensor, Tensor]:
         """How far shares of the light of some nodes fall from where they should [m], and the areas of their pupils."""
         radii = torch.linspace(0, self.reach, _LOOKED if self.reach else 1, dtype=torch.float64)
-        fitted = self._fitted(radii, self.wavelengths)
+        fitted = self._fitted(radii, self._looked)
         frame = Frame.upright(fitted)
-        own = torch.cat([radii, radii.new_zeros(1)]).repeat_interleave(len(self.vergences) * len(self.wavelengths))
+        own = torch.cat([radii, radii.new_zeros(1)]).repeat_interleave(len(self.vergences) * len(self._looked))
         return frame.slopes + (fitted.chief + own).abs()[:, None], areas(fitted, frame)

@@ -29,7 +29,7 @@ class Convolution:
 
     picture: tuple[int, int]
     window: tuple[int, int]
-    border: str  # one of BORDERS, or "given": the planes come with what lies around them
+    border: str  # one of BORDERS, "dark", or "given": the planes come with what lies around them
     size: tuple[int, int]
     bands: int  # planes whose half spectra fit into a quarter of the memory
     held: int  # planes whose spectra may wait for the backward pass
@@ -49,10 +49,13 @@ class Convolution:
 
         layers: of depth, which share another quarter for what is held. Tiles are many and hold none.
         """
-        after = border != "zero"  # zeros may share their place with those before the picture
-        rows, columns = (
-            fast_length(max(m, n + (m - 1 if after else m // 2))) for n, m in zip(picture, window, strict=True)
-        )
+
+        def reached(m: int) -> int:
+            if border == "dark":
+                return 0  # around the transform it lies on both sides
+            return m // 2 if border == "zero" else m - 1  # zeros may share their place with those before the picture
+
+        rows, columns = (fast_length(max(m, n + reached(m))) for n, m in zip(picture, window, strict=True))
         quarter = int(max_memory // (4 * rows * columns * itemsize))
         held = 0 if border == "given" else quarter // layers
         return cls(picture, window, border, (rows, columns), max(1, quarter), held)
@@ -84,7 +87,7 @@ class Convolution:
         """The border on both sides. A mirror, a seam or an edge goes on up to the transform's length: no pixel that is
         kept sees so far, and zeros would be one more copy.
         """
-        if self.border == "given":
+        if self.border in ("given", "dark"):
             return planes
         return extend_along(planes, self.window[dim], self.border, dim=dim, length=self.size[dim])
 
@@ -102,6 +105,8 @@ class Convolution:
         before, after = m // 2, (m - 1) // 2
         if self.border == "zero":
             return extended.narrow(dim, before, n)
+        if self.border == "dark":
+            return extended.narrow(dim, 0, n)
         extended = extended.narrow(dim, 0, n + before + after)
         if self.border == "given":
             return extended

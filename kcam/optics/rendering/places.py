@@ -7,7 +7,7 @@ picture may have four times as many nodes as there are PSFs, or sixteen.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -46,17 +46,17 @@ class Between:
 
     def __call__(self, places: Tensor) -> Tensor:
         """PSFs (N, ...) of places (N, 2), x and y."""
+        return torch.stack(list(self.each(places)))
+
+    def each(self, places: Tensor) -> Iterator[Tensor]:
+        """PSFs of places (N, 2), one after the other: fastest where neighbours are of one row."""
         across = cubic_weights(self.columns, places[:, 0]).to(self.psfs)
         along = cubic_weights(self.rows, places[:, 1]).to(self.psfs)
-        found = [places.new_zeros(())] * len(places)
-        for y in places[:, 1].unique().tolist():
-            own = (places[:, 1] == y).nonzero()[:, 0]
-            weights = along[own[0]]
-            near = weights.nonzero()[:, 0]
-            row = torch.tensordot(weights[near], self.psfs[near], dims=1)
-            for index, psf in zip(own.tolist(), torch.tensordot(across[own], row, dims=1), strict=True):
-                found[index] = psf
-        return torch.stack(found)
+        row, before = self.psfs, math.nan
+        for y, own, other in zip(places[:, 1].tolist(), along, across, strict=True):
+            if y != before:
+                row, before = _sum(own, self.psfs), y
+            yield _sum(other, row)
 
 
 def grid(n: int, *, apart: float) -> Tensor:
@@ -70,6 +70,13 @@ def grid(n: int, *, apart: float) -> Tensor:
 def halved(nodes: Tensor) -> Tensor:
     """Even nodes, and the middles between them."""
     return _woven(nodes, (nodes[1:] + nodes[:-1]) / 2, dim=0)
+
+
+def _sum(weights: Tensor, psfs: Tensor) -> Tensor:
+    """Of PSFs (N, ...) with weights (N,), few of them other than 0."""
+    near = weights.nonzero()[:, 0]
+    few = psfs[int(near[0]) : int(near[-1]) + 1]
+    return (weights[near[0] : near[-1] + 1] @ few.flatten(1)).view(psfs.shape[1:])
 
 
 def _woven(own: Tensor, between: Tensor, *, dim: int) -> Tensor:

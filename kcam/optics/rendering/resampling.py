@@ -15,15 +15,35 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcam.optics.rendering.borders import border_index
+from kcam.optics.rendering.borders import part
 
 Ideal = Callable[[Tensor], Tensor]
 """Where without distortion the light would fall that falls at places (..., 2) [pixels]."""
 
 _STEP, _LONG = 4, 512  # pixels between computed places, on longer sides; linear between: 2e-3 pixels for 5 %
 _UNMOVED = 1e-3  # pixels: less is not moved
-_FIXED_POINT = 12  # steps to where a row of the scene crosses a column of the picture
-_AT_ONCE = 2**22  # pixels of a plane
+_FIXED_POINT, _CROSSED = 12, 1e-6  # steps to where a row of the scene crosses a column of the picture, and pixels
+_AT_ONCE = 2**17  # pixels of a plane: they stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A smooth function at the rows and columns of a picture, linear between values (R, W) of a few rows.
+
+    before, share (H,): which of them comes before each row, and how far from there to the next it lies.
+    """
+
+    values: Tensor
+    before: Tensor
+    share: Tensor
+
+    def __len__(self) -> int:
+        return len(self.before)
+
+    def __getitem__(self, rows: slice) -> Tensor:
+        """Its values at rows, (n, W)."""
+        before, share = self.before[rows], self.share[rows, None]
+        return torch.lerp(self.values[before], self.values[before + 1], share)
 
 
 @dataclass(frozen=True)
@@ -33,14 +53,18 @@ class Resampling:
     meet columns, in scene rows.
     """
 
-    across: Tensor
-    down: Tensor
+    across: Smooth
+    down: Smooth
     border: str
 
     def __call__(self, planes: Tensor) -> Tensor:
         """Means (B, K, H, W) of planes (B, K, H, W)."""
-        along_rows = _means(planes, self.across, self.border)
-        return _means(along_rows.mT, self.down.T, self.border).mT
+        height, width = planes.shape[-2:]
+        strips = _strips(height, width)
+        along_rows = [_means(planes[..., rows, :], self.across[rows], self.border, dim=-1) for rows in strips]
+        planes = torch.cat(along_rows, dim=-2)
+        edges = (self.down[slice(rows.start, rows.stop + 1)] for rows in strips)
+        return torch.cat([_means(planes, own, self.border, dim=-2) for own in edges], dim=-2)
 
 
 def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resampling | None:
@@ -56,20 +80,26 @@ def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resamplin
     row = y[:, None].expand(-1, len(x))
     for _ in range(_FIXED_POINT):
         places = torch.stack([x.expand_as(row), row], dim=-1)
-        row = row + (y[:, None] - ideal(places)[..., 1])
+        off = y[:, None] - ideal(places)[..., 1]
+        row = row + off
+        if float(off.detach().abs().max()) < _CROSSED:
+            break
     across = ideal(torch.stack([x.expand_as(row), row], dim=-1))[..., 0]
+    across, down = across + (width - 1) / 2, down + (height - 1) / 2
     return Resampling(
-        _fine(across, x, y, columns=_edges(width), rows=_centres(height)) + (width - 1) / 2,
-        _fine(down, x, y, columns=_centres(width), rows=_edges(height)) + (height - 1) / 2,
+        _fine(across, x, y, columns=_edges(width), rows=_centres(height)),
+        _fine(down, x, y, columns=_centres(width), rows=_edges(height)),
         border,
     )
 
 
-def smooth_map(function: Callable[[Tensor], Tensor], picture: tuple[int, int]) -> Tensor:
-    """A function of places (..., 2) at the pixels of a picture about its middle, (H, W): linear between a few."""
-    (y, x), (height, width) = (_coarse(n) for n in picture), picture
-    places = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
-    return _fine(function(places), x, y, columns=_centres(width), rows=_centres(height))
+def multiplied(planes: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
+    """Planes (B, K, H, W) times a smooth function of places (..., 2) at their pixels, linear between a few."""
+    height, width = picture = (planes.shape[-2], planes.shape[-1])
+    y, x = (_coarse(n) for n in picture)
+    values = function(torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1))
+    light = _fine(values, x, y, columns=_centres(width), rows=_centres(height))
+    return torch.cat([planes[..., rows, :] * light[rows].to(planes) for rows in _strips(height, width)], dim=-2)
 
 
 def _coarse(n: int) -> Tensor:
@@ -85,37 +115,41 @@ def _centres(n: int) -> Tensor:
     return torch.arange(n, dtype=torch.float64) - (n - 1) / 2
 
 
-def _fine(values: Tensor, x: Tensor, y: Tensor, *, columns: Tensor, rows: Tensor) -> Tensor:
-    """Linear between values on a coarse grid, (rows, columns)."""
-    for nodes, at in ((x, columns), (y, rows)):
-        position = (at - nodes[0]) / (nodes[1] - nodes[0])
-        before = position.floor().clamp(0, len(nodes) - 2).long()
-        share = position - before
-        values = (values[..., before] * (1 - share) + values[..., before + 1] * share).mT
-    return values
+def _fine(values: Tensor, x: Tensor, y: Tensor, *, columns: Tensor, rows: Tensor) -> Smooth:
+    """Linear between values on a coarse grid (len(y), len(x))."""
+    before, share = _between(x, columns)
+    fine = torch.lerp(values[:, before], values[:, before + 1], share)
+    return Smooth(fine, *_between(y, rows))
 
 
-def _means(planes: Tensor, edges: Tensor, border: str) -> Tensor:
-    """Mean along each row (B, K, R, W) between neighbouring edges (R, W + 1) [pixels; pixel i is i -+ 1/2]."""
-    rows, edges = max(1, _AT_ONCE // max(1, planes.shape[-1])), edges.to(planes.device)
-    parts = zip(planes.split(rows, dim=-2), edges.split(rows), strict=True)
-    return torch.cat([_means_of(part, own, border) for part, own in parts], dim=-2)
+def _between(nodes: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Which of even nodes comes before each place, and how far from there to the next it lies."""
+    position = (at - nodes[0]) / (nodes[1] - nodes[0])
+    before = position.floor().clamp(0, len(nodes) - 2)
+    return before.long(), position - before
 
 
-def _means_of(planes: Tensor, edges: Tensor, border: str) -> Tensor:
-    start, stop = edges[:, :-1], edges[:, 1:]
+def _strips(height: int, width: int) -> list[slice]:
+    """Rows that are worked on together."""
+    step = max(1, _AT_ONCE // max(1, width))
+    return [slice(first, min(first + step, height)) for first in range(0, height, step)]
+
+
+def _means(planes: Tensor, edges: Tensor, border: str, *, dim: int) -> Tensor:
+    """Means of planes along dim -1 or -2 between neighbouring edges along it [pixels; pixel i is i -+ 1/2]."""
+    count, n = edges.shape[dim] - 1, planes.shape[dim]
+    edges = edges.to(planes.device)
+    start, stop = edges.narrow(dim, 0, count), edges.narrow(dim, 1, count)
     with torch.no_grad():
         first = (start + 0.5).floor()
-        count = int(((stop + 0.5).ceil() - first).max())
-    start, stop, first = (start - first).to(planes), (stop - first).to(planes), first.long()
-    width = stop - start
+        reached = int(((stop + 0.5).ceil() - first).max())
+        low = min(int(first.min()), n - 1)
+        high = max(int(first.max()) + reached, 1, low + 1)
+    seen = part(planes, low, high, border, dim=dim)
+    start, stop, index = (start - first).to(planes), (stop - first).to(planes), (first - low).long()
+    width, shape = stop - start, (*planes.shape[:-2], *start.shape)
     result = planes.new_zeros(())
-    for step in range(count):
+    for step in range(reached):
         share = (stop.clamp(max=step + 0.5) - start.clamp(min=step - 0.5)).clamp(min=0) / width
-        index = first + step
-        index = border_index(index, planes.shape[-1], border) if border != "zero" else index
-        if border == "zero":
-            share = torch.where((index >= 0) & (index < planes.shape[-1]), share, 0)
-            index = index.clamp(0, planes.shape[-1] - 1)
-        result = result + planes.gather(-1, index.expand(planes.shape)) * share
+        result = torch.addcmul(result, seen.gather(dim, (index + step).expand(shape)), share)
     return result

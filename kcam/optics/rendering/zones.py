@@ -9,7 +9,7 @@ what the windows share out is all there was. Between two nodes the error is of s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -19,10 +19,11 @@ from torch.utils.checkpoint import checkpoint
 from kcam.optics.numerics import linear_weights
 from kcam.optics.rendering.borders import extend
 
-Bank = Callable[[Tensor], Tensor]
-"""PSFs (N, Z, G, h, w) of places (N, 2), x and y in pixels from the picture's middle, as the upright picture has it."""
-Render = Callable[[Tensor, Tensor, Tensor | None], Tensor]
-"""Light (B, C, H, W) of PSFs (Z, G, h, w), planes (B, K, H, W) and shares of layers (B, Z, H, W); dark all around."""
+Bank = Callable[[Tensor], Iterable[Tensor]]
+"""PSFs (Z, G, h, w) of places (N, 2), x and y in pixels from the picture's middle, as the upright picture has it."""
+Render = Callable[..., Tensor]
+"""Light (B, C, H, W) of PSFs (Z, G, h, w), planes (B, K, H, W) and shares of layers (B, Z, H, W); dark all around, or
+with a border="dark"."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,16 @@ def blend(
 
     def strips(planes: Tensor, shares: Tensor | None, pair: list[int]) -> list[Tensor]:
         places = torch.cartesian_prod(rows.nodes[pair], columns.nodes).flip(1)
-        banks = bank(places).unflatten(0, (len(pair), -1))
+        psfs = iter(bank(places))
         lights = []
-        for row, psfs in zip(pair, banks, strict=True):
+        for row in pair:
             light = planes.new_zeros(())
-            for column, psf in enumerate(psfs):
-                zone = _Zone(rows, columns, row, column, window)
-                own, part = zone.cut(planes), None if shares is None else zone.cut_shares(shares)
-                margin = [0, 0] if shares is None else [m - 1 for m in window]
-                found = render(psf, torch.nn.functional.pad(own, [margin[1], margin[1], margin[0], margin[0]]), part)
-                found = found[..., margin[0] : found.shape[-2] - margin[0], margin[1] : found.shape[-1] - margin[1]]
+            for column in range(len(columns.nodes)):
+                zone, psf = _Zone(rows, columns, row, column, window), next(psfs)
+                if shares is None:
+                    found = render(psf, zone.cut(planes), None, border="dark")
+                else:
+                    found = zone.inside(render(psf, zone.cut_wide(planes), zone.cut_shares(shares)))
                 if not column:
                     light = found.new_zeros(*found.shape[:-1], width + 2 * (window[1] - 1))
                 left = columns.first[column]
@@ -116,13 +117,26 @@ class _Zone:
     window: tuple[int, int]
 
     def cut(self, planes: Tensor) -> Tensor:
-        """The node's share of planes that come with their border, and the dark around it that its PSF reaches."""
+        """The node's share of planes that come with their border, and before it the dark that its PSF reaches: around
+        the transform it is that behind it too.
+        """
+        return torch.nn.functional.pad(self._own(planes), [self.window[1] - 1, 0, self.window[0] - 1, 0])
+
+    def cut_wide(self, planes: Tensor) -> Tensor:
+        """The node's share, and the dark around it, where what hides the light of a zone may stand."""
+        sides = [((m - 1) // 2 + m - 1, m // 2 + m - 1) for m in self.window]
+        return torch.nn.functional.pad(self._own(planes), [*sides[1], *sides[0]])
+
+    def inside(self, light: Tensor) -> Tensor:
+        """What the PSF reaches, of the light of `cut_wide`."""
+        (above, before), (height, width) = (m - 1 for m in self.window), light.shape[-2:]
+        return light[..., above : height - above, before : width - before]
+
+    def _own(self, planes: Tensor) -> Tensor:
         top, bottom = self.rows.first[self.row], self.rows.last[self.row]
         left, right = self.columns.first[self.column], self.columns.last[self.column]
         weights = self.rows.weights[self.row, top:bottom, None] * self.columns.weights[self.column, left:right]
-        own = planes[..., top:bottom, left:right] * weights.to(planes)
-        (above, below), (before, after) = (((m - 1) // 2, m // 2) for m in self.window)
-        return torch.nn.functional.pad(own, [before, after, above, below])
+        return planes[..., top:bottom, left:right] * weights.to(planes)
 
     def cut_shares(self, shares: Tensor) -> Tensor:
         """Shares of layers there, and as far again around it as the PSF reaches; they come with a border of 4."""
