@@ -48,32 +48,46 @@ class Banks:
         whole: bool = False,
         mixing: Tensor | None = None,
         mixed: bool = False,
+        colours: float | None = None,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of places (F, 2) [m]; of many wavelengths the PSFs' pixels are polynomials through those
-        of a few (`colours`). Without gradients they are kept, up to `KEPT` bytes. whole, mixing, mixed:
-        see `source.FieldPSFs`.
+        of a few. Without gradients they are kept, up to `KEPT` bytes. whole, mixing, mixed, colours: see
+        `source.FieldPSFs`.
         """
-        key = (pixels, whole, mixed, _bytes(mixing), _bytes(places))
+        key = (pixels, whole, mixed, colours, _bytes(mixing), _bytes(places))
         if key in self.kept_banks:
             return self.kept_banks[key]
-        found = self._distinct(places, pixels, whole=whole, mixing=mixing, mixed=mixed).to(pixels.device)
+        nodes, shares = self.colours(pixels, mixing)[:2] if colours is None else self._few(colours)
+        if mixed and mixing is not None:
+            shares = mixing.to(shares) @ shares
+        each = len(nodes) == len(self.wavelengths) and not mixed  # stands for itself
+        found = self._distinct(places, pixels, nodes, None if each else shares, whole=whole).to(pixels.device)
         held = sum(bank.nbytes for bank in self.kept_banks.values())
         if not found.requires_grad and held + found.nbytes <= KEPT:
             self.kept_banks[key] = found
         return found
 
+    @property
+    def fewer(self) -> tuple[int, ...]:
+        """How many wavelengths may stand for all."""
+        return tuple(n for n in _COLOURS if n < len(self.wavelengths)) if self.few else ()
+
+    def _few(self, count: float) -> tuple[Tensor, Tensor]:
+        """So many wavelengths, at most all, and what each gives to those that are asked for."""
+        if count >= len(self.wavelengths):
+            return self.wavelengths, torch.eye(len(self.wavelengths), dtype=torch.float64)
+        nodes = chebyshev_between(*self.wavelengths.aminmax(), int(count))
+        return nodes, lagrange_weights(nodes, self.wavelengths)
+
     def _distinct(
-        self, places: Tensor, pixels: PixelGrid, *, whole: bool, mixing: Tensor | None, mixed: bool
+        self, places: Tensor, pixels: PixelGrid, nodes: Tensor, shares: Tensor | None, *, whole: bool
     ) -> Tensor:
         height, width = pixels.shape
         odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
         grain = 1e-6 * pixels.pitch
         own, which = ((places.abs() if self.mirrored else places) / grain).round().unique(dim=0, return_inverse=True)
-        nodes, shares, _ = self.colours(pixels, mixing)
         psfs = self.compute(own * grain, nodes, odd, whole)
-        if mixed and mixing is not None:
-            shares = mixing.to(shares) @ shares
-        if mixed or len(nodes) < len(self.wavelengths):
+        if shares is not None:
             psfs = torch.einsum("ln,fznhw->fzlhw", shares.to(psfs), psfs)
         psfs = psfs[which]
         if self.mirrored:
@@ -96,25 +110,22 @@ class Banks:
 
     @torch.no_grad()
     def _fewest(self, pixels: PixelGrid, mixing: Tensor | None) -> tuple[Tensor, Tensor, float]:
-        every = torch.eye(len(self.wavelengths), dtype=torch.float64)
-        if len(self.wavelengths) <= _COLOURS[0] or not self.few:
-            return self.wavelengths, every, 0.0
+        every = self._few(math.inf)
+        if not self.fewer:
+            return *every, 0.0
         places = torch.tensor([[0.0, 0.0], [0.42, 0.56]], dtype=torch.float64) * self.reach
-        mixing = every if mixing is None else mixing.double().cpu()
+        mixing = every[1] if mixing is None else mixing.double().cpu()
         mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
         truth = self.compute(places, self.wavelengths, pixels, False)
         truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), truth)
-        for n in _COLOURS:
-            if n >= len(self.wavelengths):
-                break
-            nodes = chebyshev_between(*self.wavelengths.aminmax(), n)
-            shares = lagrange_weights(nodes, self.wavelengths)
+        for n in self.fewer:
+            nodes, shares = self._few(n)
             found = self.compute(places, nodes, pixels, False)
             found = torch.einsum("mn,fznhw->fzmhw", (mixing @ shares).to(truth), found)
             off = float((found - truth).abs().sum((-2, -1)).max())
             if off < COLOUR_ERROR:
                 return nodes, shares, off
-        return self.wavelengths, every, 0.0
+        return *every, 0.0
 
 
 def window_side(slopes: Tensor, tail: Tensor, *, pitch: float) -> int:

@@ -7,9 +7,10 @@ those parts of the picture that hold most of its detail.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from kcam.optics.source import FieldPSFs, PixelGrid
 ALLOWED = 3e-3
 """Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]. It is an
 upper bound, of which pictures show a third or less."""
-BETWEEN = 0.75  # of that, what PSFs between those that are computed may leave, at most
+BETWEEN, COLOURED = 0.75, 0.4  # of that, what PSFs between those that are computed, and between wavelengths, may leave
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
 PROBE = 128  # pixels between the places that are tried
@@ -75,7 +76,8 @@ class FieldEstimate:
 @dataclass(frozen=True)
 class _How:
     """Pixels between nodes, and the error that this leaves; the PSFs that are computed, where nodes have theirs from
-    fewer places: how often the distance of these was halved, and the error that they leave.
+    fewer places: how often the distance of these was halved, and the error that they leave; at how many wavelengths
+    PSFs are computed, and what this leaves.
     """
 
     apart: float
@@ -83,6 +85,19 @@ class _How:
     known: Between | None = None
     halvings: int = 0
     between: float = 0.0
+    colours: float | None = None
+    coloured: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Detail:
+    """Those parts of a picture that hold most of its detail, with what lies around them; how much more of it the whole
+    has; the picture's light, squared and summed.
+    """
+
+    patches: list[tuple[Tensor, Tensor | None]]
+    weight: float
+    light: float
 
 
 @dataclass(frozen=True)
@@ -110,9 +125,9 @@ class FieldPicture:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
         planes, shares = self.moved(planes, shares)
         how = self.how(planes, shares)
-        bank: Callable[[Tensor], Iterable[Tensor]] = self.bank
+        bank: Callable[[Tensor], Iterable[Tensor]] = self._of(how.colours)
         if how.known is not None:
-            known = self._known(planes, halvings=how.halvings) if torch.is_grad_enabled() else how.known
+            known = self._known(planes, how) if torch.is_grad_enabled() else how.known
             bank = known.each
         return blend(planes, shares, bank, self.render, window=self.pixels.shape, apart=how.apart, border=self.border)
 
@@ -133,10 +148,12 @@ class FieldPicture:
 
         return resampling(ideal, picture, self.border)
 
-    def bank(self, places: Tensor) -> Tensor:
+    def bank(self, places: Tensor, *, colours: float | None = None) -> Tensor:
         """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
         on_sensor = self._on_sensor(places)
-        psfs = self.psfs.bank(on_sensor, self.pixels, whole=self.whole, mixing=self.mixing, mixed=self.mixed)
+        psfs = self.psfs.bank(
+            on_sensor, self.pixels, whole=self.whole, mixing=self.mixing, mixed=self.mixed, colours=colours
+        )
         return psfs / self.psfs.illumination(on_sensor).to(psfs).view(-1, 1, 1, 1, 1)
 
     def explain(self, planes: Tensor, shares: Tensor | None) -> FieldEstimate:
@@ -153,8 +170,10 @@ class FieldPicture:
             if self.spacing is not None and math.isinf(self.spacing):  # one PSF on purpose
                 apart = max(picture)
             elif self.spacing is not None:
-                blending = self._left(planes, shares, [self._blended(self.bank, picture, apart)])[0]
-            deviations = self.psfs.deviations(self.pixels, mixing=self.mixing)
+                blending = self._left(self._detail(planes, shares, self.bank), self._blended(self.bank, picture, apart))
+            deviations = self.psfs.deviations(self.pixels, mixing=self.mixing, colours=how.colours)
+            if how.colours is not None:
+                deviations["colours"] = how.coloured
             return FieldEstimate((rows, columns), int(apart), blending, how.between, **deviations)
 
     @property
@@ -164,11 +183,15 @@ class FieldPicture:
     def _on_sensor(self, places: Tensor) -> Tensor:
         return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
 
-    def _known(self, planes: Tensor, *, halvings: int) -> Between:
-        sides = (planes.shape[-2], planes.shape[-1])
-        known = Between.known(self.bank, sides, apart=2.0 * _probe(sides))
-        for _ in range(halvings):
-            known = known.refined(self.bank)
+    def _of(self, colours: float | None) -> Bank:
+        return functools.partial(self.bank, colours=colours)
+
+    def _known(self, planes: Tensor, how: _How) -> Between:
+        """PSFs of those places at which `how` has them."""
+        sides, bank = (planes.shape[-2], planes.shape[-1]), self._of(how.colours)
+        known = Between.known(bank, sides, apart=2.0 * _probe(sides))
+        for _ in range(how.halvings):
+            known = known.refined(bank)
         return known
 
     @torch.no_grad()
@@ -178,19 +201,36 @@ class FieldPicture:
             return _How(self.spacing)
         sides = (planes.shape[-2], planes.shape[-1])
         probe = _probe(sides)
-        known, halvings = self._known(planes, halvings=0), 0
+        detail = self._detail(planes, shares, self._of(math.inf))
+        colours, coloured = self._colours(detail, sides)
+        bank, rest = self._of(colours), ALLOWED**2 - coloured**2
+        how = _How(probe, colours=colours, coloured=coloured)
+        known = self._known(planes, how)
         while True:
-            off, error = self._left(
-                planes, shares, [self._interpolated(known, sides), self._blended(known, sides, probe)]
-            )
-            apart, error = _apart(error, probe, allowed=math.sqrt(ALLOWED**2 - min(off, BETWEEN * ALLOWED) ** 2))
+            off = self._left(detail, self._interpolated(bank, known, sides))
+            error = self._left(detail, self._blended(known, sides, probe))
+            apart, error = _apart(error, probe, allowed=math.sqrt(rest - min(off, BETWEEN * ALLOWED) ** 2))
             if off <= BETWEEN * ALLOWED:
-                return _How(apart, error, known, halvings, off)
-            if probe / 2**halvings < apart or 4 * known.psfs.nbytes > self.most:
+                return replace(how, apart=apart, blending=error, known=known, between=off)
+            if probe / 2**how.halvings < apart or 4 * known.psfs.nbytes > self.most:
                 break
-            known, halvings = known.refined(self.bank), halvings + 1
-        apart, error = _apart(self._left(planes, shares, [self._blended(self.bank, sides, probe)])[0], probe)
-        return _How(apart, error)
+            known, how = known.refined(bank), replace(how, halvings=how.halvings + 1)
+        error = self._left(detail, self._blended(bank, sides, probe))
+        apart, error = _apart(error, probe, allowed=math.sqrt(rest))
+        return replace(how, apart=apart, blending=error)
+
+    def _colours(self, detail: _Detail, sides: tuple[int, int]) -> tuple[float, float]:
+        """At how many wavelengths PSFs are computed, and what this leaves."""
+        every, last = self._of(math.inf), _last(sides)
+
+        def off(cell: Tensor, count: int) -> Tensor:
+            return every(cell * last) - self.bank(cell * last, colours=count)
+
+        for count in self.psfs.fewer_colours:
+            left = self._left(detail, functools.partial(off, count=count))
+            if left <= COLOURED * ALLOWED:
+                return count, left
+        return math.inf, 0.0
 
     def _blended(self, bank: Bank, sides: tuple[int, int], apart: float) -> Bank:
         """What windows between nodes so far apart are off by, in the middle of a cell at parts (1, 2) of a quadrant."""
@@ -204,12 +244,12 @@ class FieldPicture:
 
         return off
 
-    def _interpolated(self, between: Between, sides: tuple[int, int]) -> Bank:
+    def _interpolated(self, bank: Bank, between: Between, sides: tuple[int, int]) -> Bank:
         """What PSFs between those that are known are off by, in the middle of a cell at parts (1, 2) of a quadrant."""
 
         def off(cell: Tensor) -> Tensor:
             middle = between.middle(cell * _last(sides))
-            return self.bank(middle) - between(middle)
+            return bank(middle) - between(middle)
 
         return off
 
@@ -221,35 +261,33 @@ class FieldPicture:
         return planes
 
     @torch.no_grad()
-    def _left(self, planes: Tensor, shares: Tensor | None, deviations: list[Bank]) -> list[float]:
-        """Of the light where PSFs deviate so from what they should be, rms, relative: in the worst of some cells, on
-        the patches of the picture with most detail, for all of its detail.
-        """
+    def _detail(self, planes: Tensor, shares: Tensor | None, bank: Bank) -> _Detail:
         height, width = planes.shape[-2:]
         detail = _detail(planes)
         most = detail.flatten().argsort(descending=True)[:_PATCHES]
-        patches = [
-            [None if own is None else self._patch(own, divmod(at, detail.shape[1])) for own in (planes, shares)]
-            for at in most.tolist()
-        ]
-        cells = [torch.tensor([cell], dtype=torch.float64) for cell in _CELLS]
-        weight = float(detail.sum() / detail.flatten()[most].sum().clamp(min=1e-300))
+        places = [divmod(at, detail.shape[1]) for at in most.tolist()]
+        patches = [(self._patch(planes, at), None if shares is None else self._patch(shares, at)) for at in places]
         step = max(1, math.isqrt(height * width // _SAMPLED))
-        point = self.bank(torch.zeros(1, 2, dtype=torch.float64))[0].sum((-2, -1), keepdim=True)[:1]
+        point = bank(torch.zeros(1, 2, dtype=torch.float64))[0].sum((-2, -1), keepdim=True)[:1]
         light = self.render(point, planes[..., ::step, ::step].contiguous(), None).double().square().sum() * step**2
+        weight = detail.sum() / detail.flatten()[most].sum().clamp(min=1e-300)
+        return _Detail(patches, float(weight), float(light))
+
+    @torch.no_grad()
+    def _left(self, detail: _Detail, deviation: Bank) -> float:
+        """Of the light where PSFs deviate so from what they should be, rms, relative: in the worst of some cells, on
+        the patches of the picture with most detail, for all of its detail.
+        """
         before, left = (m // 2 for m in self.pixels.shape)
-        found = []
-        for deviation in deviations:
-            worst = uneven = 0.0
-            for cell in cells:
-                off, squares = deviation(cell)[0], 0.0
-                uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
-                for own, around in patches:
-                    seen = self.render(off, own, around, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
-                    squares += float(seen.double().square().sum())
-                worst = max(worst, squares)
-            found.append(math.sqrt(worst * weight / max(float(light), 1e-300) + uneven**2))
-        return found
+        worst = uneven = 0.0
+        for cell in _CELLS:
+            off, squares = deviation(torch.tensor([cell], dtype=torch.float64))[0], 0.0
+            uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
+            for own, around in detail.patches:
+                seen = self.render(off, own, around, occlusion=False)[..., before:, left:][..., :_PATCH, :_PATCH]
+                squares += float(seen.double().square().sum())
+            worst = max(worst, squares)
+        return math.sqrt(worst * detail.weight / max(detail.light, 1e-300) + uneven**2)
 
 
 def _probe(sides: tuple[int, int]) -> int:

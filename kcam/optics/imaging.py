@@ -432,7 +432,7 @@ class Imaging(Stage):
         tried = 0 if own.spacing is not None or not own.field_variation else PROBED
         groups = len(self._psf_wavelengths(scene.wavelengths))
         computed = float(min(groups, _COLOURS))
-        colours = 2.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
+        colours = 4.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
         sides = [
             min(n, math.ceil(2 * n / max(1, k - 1))) + m - 1 for n, m, k in zip(picture, window, nodes, strict=True)
         ]

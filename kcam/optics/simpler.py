@@ -29,14 +29,20 @@ class SimplerField:
         whole: bool = False,
         mixing: Tensor | None = None,
         mixed: bool = False,
+        colours: float | None = None,
     ) -> Tensor:
         """Without field variation the PSF of the axis, with the light that each place has."""
         own = places if self.field_variation else torch.zeros_like(places[:1])
-        found = self.psfs.bank(own, pixels, whole=whole, mixing=mixing, mixed=mixed)
+        found = self.psfs.bank(own, pixels, whole=whole, mixing=mixing, mixed=mixed, colours=colours)
         if self.field_variation and self.relative_illumination:
             return found
         factor = self.illumination(places) / self.psfs.illumination(own)
         return found * factor.to(found).view(-1, 1, 1, 1, 1)
+
+    @property
+    def fewer_colours(self) -> tuple[int, ...]:
+        """Those of the optics."""
+        return self.psfs.fewer_colours
 
     def illumination(self, places: Tensor) -> Tensor:
         """That of the optics, or 1 everywhere."""
@@ -59,6 +65,8 @@ class SimplerField:
         others = self.psfs.at_wavelengths(wavelengths, lateral_colour=lateral_colour)
         return SimplerField(others, self.field_variation, self.distortion, self.relative_illumination)
 
-    def deviations(self, pixels: PixelGrid, *, mixing: Tensor | None = None) -> dict[str, float]:
+    def deviations(
+        self, pixels: PixelGrid, *, mixing: Tensor | None = None, colours: float | None = None
+    ) -> dict[str, float]:
         """Those of the optics: what is left out on purpose is not counted."""
-        return self.psfs.deviations(pixels, mixing=mixing)
+        return self.psfs.deviations(pixels, mixing=mixing, colours=colours)

@@ -75,11 +75,17 @@ class FieldPSFs:
         whole: bool = False,
         mixing: Tensor | None = None,
         mixed: bool = False,
+        colours: float | None = None,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
         of a point on the axis: see `banks.Banks`.
         """
-        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, mixed=mixed)
+        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, mixed=mixed, colours=colours)
+
+    @property
+    def fewer_colours(self) -> tuple[int, ...]:
+        """How many wavelengths may stand for all."""
+        return self._banks.fewer
 
     @functools.cached_property
     def _banks(self) -> Banks:
@@ -99,10 +105,12 @@ class FieldPSFs:
         return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
 
     @torch.no_grad()
-    def deviations(self, pixels: PixelGrid, *, mixing: Tensor | None = None) -> dict[str, float]:
+    def deviations(
+        self, pixels: PixelGrid, *, mixing: Tensor | None = None, colours: float | None = None
+    ) -> dict[str, float]:
         """What PSFs may be off by, of their light: see `field.FieldEstimate`."""
         places = torch.tensor([[0.0, 0.0], [0.54, 0.72]], dtype=torch.float64) * self.reach
-        psfs = self.bank(places, pixels, mixing=mixing)
+        psfs = self.bank(places, pixels, mixing=mixing, colours=colours)
         radii = places.norm(dim=1)
         fitted = self._fitted(radii, self.wavelengths)
         frame = Frame.upright(fitted)
@@ -113,7 +121,7 @@ class FieldPSFs:
         )
         return {
             "pupils": pupils,
-            "colours": self._banks.colours(pixels, mixing)[2],
+            "colours": self._banks.colours(pixels, mixing)[2] if colours is None else 0.0,
             "sampling": QUICK_ERROR,
             "outside": float(lost.max().clamp(min=0)),
         }
