@@ -125,10 +125,7 @@ class FieldPicture:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
         planes, shares = self.moved(planes, shares)
         how = self.how(planes, shares)
-        bank: Callable[[Tensor], Iterable[Tensor]] = self._of(how.colours)
-        if how.known is not None:
-            known = self._known(planes, how) if torch.is_grad_enabled() else how.known
-            bank = known.each
+        bank: Callable[[Tensor], Iterable[Tensor]] = self._of(how.colours) if how.known is None else how.known.each
         return blend(planes, shares, bank, self.render, window=self.pixels.shape, apart=how.apart, border=self.border)
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -186,15 +183,6 @@ class FieldPicture:
     def _of(self, colours: float | None) -> Bank:
         return functools.partial(self.bank, colours=colours)
 
-    def _known(self, planes: Tensor, how: _How) -> Between:
-        """PSFs of those places at which `how` has them."""
-        sides, bank = (planes.shape[-2], planes.shape[-1]), self._of(how.colours)
-        known = Between.known(bank, sides, apart=2.0 * _probe(sides))
-        for _ in range(how.halvings):
-            known = known.refined(bank)
-        return known
-
-    @torch.no_grad()
     def how(self, planes: Tensor, shares: Tensor | None) -> _How:
         """How densely PSFs are computed, and nodes lie, for `ALLOWED`: planes as they were moved."""
         if self.spacing is not None:
@@ -205,7 +193,7 @@ class FieldPicture:
         colours, coloured = self._colours(detail, sides)
         bank, rest = self._of(colours), ALLOWED**2 - coloured**2
         how = _How(probe, colours=colours, coloured=coloured)
-        known = self._known(planes, how)
+        known = Between.known(bank, sides, apart=2.0 * probe)
         while True:
             off = self._left(detail, self._interpolated(bank, known, sides))
             error = self._left(detail, self._blended(known, sides, probe))

@@ -596,6 +596,7 @@ class Imaging(Stage):
         field, planes, shares = self._asked(scene, colour_filter)
         return field.explain(planes, shares)
 
+    @torch.no_grad()
     def apart(self, scene: Scene, *, colour_filter: Absorber | None = None) -> int:
         """How many pixels lie between the places of a picture over the field, at least; arguments as of `explain`."""
         if self.accuracy.spacing is not None:

@@ -254,17 +254,19 @@ def images(
             own = frame[part]
             count = min(length, 2 * math.ceil(float(own.half.max()) / spacing) + _ROOM)
             path, clearances = _known(fitted, nodes[part], own, spacing * (count / 2), offsets[part])
-            matrix = _from_chebyshev(fitted.degree, count)[1].to(path.device)
+            chebyshev_points, matrix = (part.to(path.device) for part in _from_chebyshev(fitted.degree, count))
             low = matrix.to(pixels.dtype)
             openings = Openings(edge_distance(low @ clearances[:, colours].to(pixels.dtype) @ low.mT))
             lights = []
             for index, wavelength in enumerate(wavelengths.tolist()):
-                phase = (matrix @ (path[:, index] * (2 * math.pi / wavelength)) @ matrix.mT).remainder_(2 * math.pi)
-                passed = openings.at(weights[index])
-                field = phasor(phase.to(pixels.dtype)) * passed
                 points_per_pixel = per_pixel * shortest / wavelength
                 points = math.ceil(points_per_pixel * margin)
-                image = squared(_middle(_middle(field, length, points).mT, length, points).mT)
+                tilt = (math.pi * points * count / length) * chebyshev_points  # brings the image's first point to 0
+                waves = path[:, index] * (2 * math.pi / wavelength) - tilt - tilt[:, None]
+                phase = (matrix @ waves @ matrix.mT).remainder_(2 * math.pi)
+                passed = openings.at(weights[index])
+                field = phasor(phase.to(pixels.dtype)) * passed
+                image = squared(_first(_first(field, length, 2 * points + 1).mT, length, 2 * points + 1).mT)
                 if not pixels.integrate:
                     image = _every(image, int(per_pixel))
                 light = Pixels(pixels.shape, points_per_pixel, integrate=pixels.integrate).of_image(image)
@@ -279,10 +281,9 @@ def images(
     return torch.cat(found)[torch.tensor(order).argsort()]
 
 
-def _middle(field: Tensor, length: int, reach: int) -> Tensor:
-    """Spectrum (..., A, 2 reach + 1) of rows (..., A, B) at the frequencies about 0."""
-    spectrum = torch.fft.ifft(field, n=length, norm="forward")
-    return torch.cat([spectrum[..., length - reach :], spectrum[..., : reach + 1]], dim=-1)
+def _first(field: Tensor, length: int, count: int) -> Tensor:
+    """Spectrum (..., A, count) of rows (..., A, B) at the first frequencies."""
+    return torch.fft.ifft(field, n=length, norm="forward")[..., :count]
 
 
 def _every(image: Tensor, step: int) -> Tensor:

@@ -21,6 +21,7 @@ DEGREES = (12, 16, 20)
 """Of the polynomials, even in dx: 49, 81 or 121 terms. The first whose residual is small enough is taken."""
 ENOUGH = 2e-4  # of a wavelength: what a fit of a wavefront may leave (rms)
 _FEWEST = 12  # rays that pass
+_FEW_NODES = 4
 _LESS = 12.0  # exponent of the weight for a clearance below 0
 _FAR = -0.3  # clearance of rays that are left out: they may come from anywhere, and widen what is fitted
 OVERFILL = 1.12  # of the stop's radius, to which rays are sent: seen from off the axis the stop is no ellipse
@@ -127,18 +128,26 @@ def fit(
         centre = (low + high) / 2
         others = least[:, None].expand_as(clearances)  # surfaces that clip nothing that the rest lets pass are left out
         clips = ((clearances <= others + 1e-12) & (others < 0.02) & (others > _FAR)).any(0).any(1)
-    clearances = clearances[:, clips]
-    for degree in DEGREES:
+    u, v = dx / half[:, :1], (dy - centre[:, None]) / half[:, 1:]
+    data = torch.cat([wavefront[:, None], clearances[:, clips]], dim=1).mT
+
+    def fitted(degree: int, own: Tensor | slice) -> tuple[Tensor, Tensor]:
         rows, columns = _orders(degree)
-        u, v = dx / half[:, :1], (dy - centre[:, None]) / half[:, 1:]
-        terms = (chebyshev(v, degree)[rows] * chebyshev(u, degree)[::2][columns]).movedim(0, -1)
-        data = torch.cat([wavefront[:, None], clearances], dim=1).mT
-        q, r = torch.linalg.qr(terms * weights[..., None])
-        found = torch.linalg.solve_triangular(r, q.mT @ (data * weights[..., None]), upper=True)  # (N, T, 1 + S)
+        terms = (chebyshev(v[own], degree)[rows] * chebyshev(u[own], degree)[::2][columns]).movedim(0, -1)
+        q, r = torch.linalg.qr(terms * weights[own][..., None])
+        found = torch.linalg.solve_triangular(r, q.mT @ (data[own] * weights[own][..., None]), upper=True)
         with torch.no_grad():
-            off = (terms @ found[..., :1])[..., 0] - data[..., 0]
-            residual = ((off**2 * (least > 0)).sum(1) / passed).sqrt()
-        fitted = PupilFit(degree, centre, half, found[..., 0], found[..., 1:].mT, chief, residual)
-        if float(residual.max()) <= enough:
+            off = (terms @ found[..., :1])[..., 0] - data[own][..., 0]
+            return found, ((off**2 * (least[own] > 0)).sum(1) / passed[own]).sqrt()
+
+    few = torch.linspace(0, len(dx) - 1, min(len(dx), _FEW_NODES)).long()  # tell of most degrees that they are too low
+    for degree in DEGREES:
+        last = degree == DEGREES[-1]
+        if not last:
+            with torch.no_grad():
+                if float(fitted(degree, few)[1].max()) > enough:
+                    continue
+        found, residual = fitted(degree, slice(None))
+        if last or float(residual.max()) <= enough:
             break
-    return fitted
+    return PupilFit(degree, centre, half, found[..., 0], found[..., 1:].mT, chief, residual)

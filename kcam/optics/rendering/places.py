@@ -6,6 +6,7 @@ picture may have four times as many nodes as there are PSFs, or sixteen.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -49,14 +50,16 @@ class Between:
         return torch.stack(list(self.each(places)))
 
     def each(self, places: Tensor) -> Iterator[Tensor]:
-        """PSFs of places (N, 2), one after the other: fastest where neighbours are of one row."""
+        """PSFs of places (N, 2), row by row, one after the other."""
         across = cubic_weights(self.columns, places[:, 0]).to(self.psfs)
         along = cubic_weights(self.rows, places[:, 1]).to(self.psfs)
-        row, before = self.psfs, math.nan
-        for y, own, other in zip(places[:, 1].tolist(), along, across, strict=True):
-            if y != before:
-                row, before = _sum(own, self.psfs), y
-            yield _sum(other, row)
+        for _, group in itertools.groupby(range(len(places)), key=places[:, 1].tolist().__getitem__):
+            own = list(group)
+            row = _sum(along[own[0]], self.psfs)
+            if row.requires_grad:  # on the way back each would fill a row of its own with zeros
+                yield from (across[own] @ row.flatten(1)).unflatten(1, row.shape[1:])
+            else:
+                yield from (_sum(across[index], row) for index in own)
 
 
 def grid(n: int, *, apart: float) -> Tensor:
