@@ -8,12 +8,14 @@ even light. A pixel's light is even over it: where pixels are stretched by 10 %,
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from kcam.optics.rendering.borders import part
 
@@ -37,8 +39,13 @@ class Smooth:
     before: Tensor
     share: Tensor
 
-    def __len__(self) -> int:
-        return len(self.before)
+    def strips(self, rows: list[slice]) -> Iterable[Tensor]:
+        """Its values at neighbouring strips of rows. With a graph they are parts of one: on the way back each
+        strip of its own would fill all values with zeros.
+        """
+        if self.values.requires_grad:
+            return self[rows[0].start : rows[-1].stop].split([own.stop - own.start for own in rows])
+        return (self[own] for own in rows)
 
     def __getitem__(self, rows: slice) -> Tensor:
         """Its values at rows, (n, W)."""
@@ -59,12 +66,19 @@ class Resampling:
 
     def __call__(self, planes: Tensor) -> Tensor:
         """Means (B, K, H, W) of planes (B, K, H, W)."""
-        height, width = planes.shape[-2:]
-        strips = _strips(height, width)
-        along_rows = [_means(planes[..., rows, :], self.across[rows], self.border, dim=-1) for rows in strips]
-        planes = torch.cat(along_rows, dim=-2)
-        edges = (self.down[slice(rows.start, rows.stop + 1)] for rows in strips)
-        return torch.cat([_means(planes, own, self.border, dim=-2) for own in edges], dim=-2)
+        strips = _strips(*planes.shape[-2:])
+        after = [slice(rows.start + 1, rows.stop + 1) for rows in strips]
+        parts = zip(planes.split(strips[0].stop, dim=-2), self.across.strips(strips), strict=True)
+        planes = torch.cat([self._means(own, at[:, :-1], at[:, 1:], dim=-1) for own, at in parts], dim=-2)
+        edges = zip(self.down.strips(strips), self.down.strips(after), strict=True)
+        return torch.cat([self._means(planes, *own, dim=-2) for own in edges], dim=-2)
+
+    def _means(self, planes: Tensor, start: Tensor, stop: Tensor, *, dim: int) -> Tensor:
+        """Means of a strip; where gradients are asked for, what it takes is computed again on the way back."""
+        own = functools.partial(_means, planes, border=self.border, dim=dim)
+        if torch.is_grad_enabled() and (planes.requires_grad or start.requires_grad):
+            return checkpoint(own, start, stop, use_reentrant=False)
+        return own(start, stop)
 
 
 def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resampling | None:
@@ -135,11 +149,9 @@ def _strips(height: int, width: int) -> list[slice]:
     return [slice(first, min(first + step, height)) for first in range(0, height, step)]
 
 
-def _means(planes: Tensor, edges: Tensor, border: str, *, dim: int) -> Tensor:
-    """Means of planes along dim -1 or -2 between neighbouring edges along it [pixels; pixel i is i -+ 1/2]."""
-    count, n = edges.shape[dim] - 1, planes.shape[dim]
-    edges = edges.to(planes.device)
-    start, stop = edges.narrow(dim, 0, count), edges.narrow(dim, 1, count)
+def _means(planes: Tensor, start: Tensor, stop: Tensor, *, border: str, dim: int) -> Tensor:
+    """Means of planes along dim -1 or -2 over stretches of it (H, W) [pixels; pixel i is i -+ 1/2]."""
+    start, stop, n = start.to(planes.device), stop.to(planes.device), planes.shape[dim]
     with torch.no_grad():
         first = (start + 0.5).floor()
         reached = int(((stop + 0.5).ceil() - first).max())
