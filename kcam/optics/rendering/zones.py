@@ -75,13 +75,13 @@ def blend(
         psfs = iter(bank(places))
         lights = []
         for row in pair:
-            light = planes.new_zeros(())
+            band, light = planes[..., rows.first[row] : rows.last[row], :], planes.new_zeros(())
             for column in range(len(columns.nodes)):
                 zone, psf = _Zone(rows, columns, row, column, window), next(psfs)
                 if shares is None:
-                    found = render(psf, zone.cut(planes), None, border="dark")
+                    found = render(psf, zone.cut(band), None, border="dark")
                 else:
-                    found = zone.inside(render(psf, zone.cut_wide(planes), zone.cut_shares(shares)))
+                    found = zone.inside(render(psf, zone.cut_wide(band), zone.cut_shares(shares)))
                 if not column:
                     light = found.new_zeros(*found.shape[:-1], width + 2 * (window[1] - 1))
                 left = columns.first[column]
@@ -116,27 +116,27 @@ class _Zone:
     column: int
     window: tuple[int, int]
 
-    def cut(self, planes: Tensor) -> Tensor:
-        """The node's share of planes that come with their border, and before it the dark that its PSF reaches: around
-        the transform it is that behind it too.
+    def cut(self, band: Tensor) -> Tensor:
+        """The node's share of its rows of planes, that come with their border, and before it the dark that its PSF
+        reaches: around the transform it is that behind it too.
         """
-        return torch.nn.functional.pad(self._own(planes), [self.window[1] - 1, 0, self.window[0] - 1, 0])
+        return torch.nn.functional.pad(self._own(band), [self.window[1] - 1, 0, self.window[0] - 1, 0])
 
-    def cut_wide(self, planes: Tensor) -> Tensor:
+    def cut_wide(self, band: Tensor) -> Tensor:
         """The node's share, and the dark around it, where what hides the light of a zone may stand."""
         sides = [((m - 1) // 2 + m - 1, m // 2 + m - 1) for m in self.window]
-        return torch.nn.functional.pad(self._own(planes), [*sides[1], *sides[0]])
+        return torch.nn.functional.pad(self._own(band), [*sides[1], *sides[0]])
 
     def inside(self, light: Tensor) -> Tensor:
         """What the PSF reaches, of the light of `cut_wide`."""
         (above, before), (height, width) = (m - 1 for m in self.window), light.shape[-2:]
         return light[..., above : height - above, before : width - before]
 
-    def _own(self, planes: Tensor) -> Tensor:
+    def _own(self, band: Tensor) -> Tensor:
         top, bottom = self.rows.first[self.row], self.rows.last[self.row]
         left, right = self.columns.first[self.column], self.columns.last[self.column]
         weights = self.rows.weights[self.row, top:bottom, None] * self.columns.weights[self.column, left:right]
-        return planes[..., top:bottom, left:right] * weights.to(planes)
+        return band[..., left:right] * weights.to(band)
 
     def cut_shares(self, shares: Tensor) -> Tensor:
         """Shares of layers there, and as far again around it as the PSF reaches; they come with a border of 4."""
