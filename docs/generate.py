@@ -276,7 +276,7 @@ def field_table() -> str:
         who = row["who"] + (", a star field" if row["scene"] == "stars" else "")
         times = [seconds_text(row[name]) if name in row else "" for name in ("first", "second")]
         memory = f"{figures(row['peak_memory'] / 1e6)} MB" if row.get("peak_memory") is not None else ""
-        quality = f"{row['psnr']:.0f} dB" if "psnr" in row else row.get("skipped", "")
+        quality = f"{row['psnr']:.0f} dB" if "psnr" in row else ""
         quality += f", {row['psnr_worst']:.0f}" if "psnr_worst" in row else ""
         places = " x ".join(map(str, row.get("places", ())))
         lines.append(f"| {title} | {who} | {places} | {' | '.join(times)} | {memory} | {quality} |")
