@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcam import optics
 from kcam.context import Context
-from kcam.optics.rendering.borders import BORDERS
+from kcam.optics.rendering.borders import BORDERS, part, part_of
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.ways import WAYS as TABLE
 from kcam.scene import Scene
@@ -96,6 +96,42 @@ def test_every_row_of_the_table_gives_what_the_chosen_one_gives(name: str, conte
     torch.testing.assert_close(light, renderer.blur(planes, layer=0))
 
 
+@pytest.mark.parametrize("way", [{}, *WAYS.values()])
+def test_dark_before_a_picture_is_dark_around_it(way: dict) -> None:
+    """Around a transform it lies on both sides: the whole light of a zone, with nothing beside it."""
+    window, zone = (6, 9), random(2, 3, 14, 11, seed=1)
+    before = [m - 1 for m in window]
+    results = []
+    for border, pads in (("dark", (before[1], 0, before[0], 0)), ("zero", None)):
+        planes, psfs = zone.clone().requires_grad_(), random(1, 3, *window, seed=2).requires_grad_()
+        (above, below), (left, right) = (((m - 1) // 2, m // 2) for m in window)
+        padded = torch.nn.functional.pad(planes, pads or (left, right, above, below))
+        picture = (padded.shape[-2], padded.shape[-1])
+        renderer = Renderer(psfs, spectra=None, weights=random(2, 3, seed=4), picture=picture, border=border, **way)
+        light = renderer.blur(padded, layer=0)
+        results.append((light, *torch.autograd.grad((light * random(*light.shape, seed=5)).sum(), (planes, psfs))))
+    for own, expected in zip(*results, strict=True):
+        torch.testing.assert_close(own, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("border", BORDERS)
+@pytest.mark.parametrize("dim", [-1, -2])
+def test_a_part_of_strips_is_that_of_the_whole(border: str, dim: int) -> None:
+    generator = torch.Generator().manual_seed(3)
+    for n, step in ((17, 5), (12, 4), (3, 7), (1, 1)):
+        planes = random(1, 2, n, 6, seed=n) if dim == -2 else random(1, 2, 6, n, seed=n)
+        for _ in range(20):
+            start = int(torch.randint(-2 * n, n, (), generator=generator))
+            stop = int(torch.randint(max(start + 1, 1), 3 * n + 2, (), generator=generator))
+            whole = part(planes, start, stop, border, dim=dim)
+            for index, place in enumerate(range(start, stop)):
+                if border == "zero" and not 0 <= place < n:
+                    assert not bool(whole.select(dim, index).any())
+                elif 0 <= place < n:
+                    assert torch.equal(whole.select(dim, index), planes.select(dim, place))
+            assert torch.equal(part_of(planes.split(step, dim), start, stop, border, dim=dim), whole)
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_every_way_renders_layers(way: str) -> None:
     scene, colours = ramp(), ColourFilter.kodak()
@@ -160,7 +196,7 @@ def test_kappa_sets_the_pupil_sampling() -> None:
         ({"tile": 0}, "tile must be a positive number of pixels, or None, got 0"),
         ({"rank": 0}, "rank must be a positive number of factors, or None, got 0"),
         ({"kappa": 1.0}, "kappa must be above 1 sample per fringe, got 1. Its default is 2.7"),
-        ({"precision": "half"}, "precision must be \"float32\", \"float64\" or None for the scene's, got 'half'"),
+        ({"precision": "half"}, 'precision must be "float32", "float64" or None for the scene\'s, got \'half\''),
     ],
 )
 def test_bad_shortcuts_say_what_is_wrong(arguments: dict, text: str) -> None:

@@ -178,6 +178,32 @@ def test_a_picture_is_that_of_one_psf_for_each_pixel(name: str, stop: float, pit
     assert estimate.total > 0
 
 
+OTHERS = [
+    pytest.param("ef50", 10 * um, marks=pytest.mark.slow),
+    pytest.param("cooke_triplet", 9 * um, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("name", "pitch"), [("tessar", 14 * um), *OTHERS])
+def test_a_scene_tells_at_how_many_wavelengths_its_psfs_are_computed(name: str, pitch: float) -> None:
+    """60 dB of a picture of 28 bands, against PSFs of all of them at places near each other."""
+    scene = Scene.from_rgb(noise(1, 3, 64, 80, seed=5) ** 2, depth=1.0)
+    imaging = optics.Imaging(small(name), pixel_pitch=pitch)
+    colours = sensor.ColourFilter.kodak()
+    picture = imaging(scene, colour_filter=colours)
+    field, planes, shares = imaging._asked(scene, colours)
+    how = field.how(*field.moved(planes, shares))
+    assert how.colours is not None
+    assert how.colours < 28
+    expected = imaging.changed(spacing=10)
+    every = expected(scene, colour_filter=colours)
+    rms = float((picture - every).square().mean().sqrt())
+    assert 20 * math.log10(float(every.max()) / rms) > 60
+    estimate = imaging.explain(scene, colour_filter=colours)
+    assert estimate.colours == pytest.approx(how.coloured)
+    assert estimate.total > rms / float(every.square().mean().sqrt()) / 3
+
+
 def test_the_adjoint_of_the_linear_part() -> None:
     imaging = optics.Imaging(small(), pixel_pitch=50 * um, psf_shape=(9, 9), spacing=16)
     x = (noise(1, 2, 20, 27) + 0.1).requires_grad_()
