@@ -25,11 +25,15 @@ ALLOWED = 3e-3
 """Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]. It is an
 upper bound, of which pictures show a third or less."""
 BETWEEN, COLOURED = 0.75, 0.4  # of that, what PSFs between those that are computed, and between wavelengths, may leave
+SHARED = 0.4
+"""What blending leaves (rms), of what linear windows are off by in the middle between nodes that have their own PSFs:
+see `places.cubic_weights`; 0.3 for what bends along one axis."""
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
 PROBE = 128  # pixels between the places that are tried
 _SAMPLED = 2**18  # pixels by which a picture's light is known
 _CELLS = ((0.12, 0.09), (0.45, 0.4), (0.68, 0.74), (0.97, 0.94))  # places of the quadrant, of half its sides
+_COLOUR_CELLS = _CELLS[1::2]
 PROBED = 5 * len(_CELLS)  # places whose PSFs are computed to try
 
 Render = Callable[..., Tensor]
@@ -75,15 +79,13 @@ class FieldEstimate:
 
 @dataclass(frozen=True)
 class _How:
-    """Pixels between nodes, and the error that this leaves; the PSFs that are computed, where nodes have theirs from
-    fewer places: how often the distance of these was halved, and the error that they leave; at how many wavelengths
-    PSFs are computed, and what this leaves.
+    """Pixels between nodes, and the error that this leaves; the PSFs from which nodes have theirs, and the error that
+    these leave; at how many wavelengths PSFs are computed, and what this leaves.
     """
 
     apart: float
     blending: float = 0.0
     known: Between | None = None
-    halvings: int = 0
     between: float = 0.0
     colours: float | None = None
     coloured: float = 0.0
@@ -124,9 +126,21 @@ class FieldPicture:
     def light(self, planes: Tensor, shares: Tensor | None) -> Tensor:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
         planes, shares = self.moved(planes, shares)
-        how = self.how(planes, shares)
-        bank: Callable[[Tensor], Iterable[Tensor]] = self._of(how.colours) if how.known is None else how.known.each
-        return blend(planes, shares, bank, self.render, window=self.pixels.shape, apart=how.apart, border=self.border)
+        how, window = self.how(planes, shares), self.pixels.shape
+        rows, columns = (Axis.of(n, m, apart=how.apart) for n, m in zip(planes.shape[-2:], window, strict=True))
+        bank: Callable[[Tensor], Iterable[Tensor]] = self._of(how.colours)
+        if how.known is not None:
+            bank = how.known.shared(rows.nodes, columns.nodes).each
+        return blend(
+            planes,
+            shares,
+            bank,
+            self.render,
+            nodes=(rows, columns),
+            window=window,
+            border=self.border,
+            mirrored=self._mirrored,
+        )
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Where distortion brings them, planes times the relative illumination there: nodes share out what is left."""
@@ -189,23 +203,33 @@ class FieldPicture:
             return _How(self.spacing)
         sides = (planes.shape[-2], planes.shape[-1])
         probe = _probe(sides)
-        detail = self._detail(planes, shares, self._of(math.inf))
+        fewest = self.psfs.fewer_colours[:1] or (math.inf,)
+        detail = self._detail(planes, shares, self._of(fewest[0]))
         colours, coloured = self._colours(detail, sides)
         bank, rest = self._of(colours), ALLOWED**2 - coloured**2
         how = _How(probe, colours=colours, coloured=coloured)
-        known = Between.known(bank, sides, apart=2.0 * probe)
+        places, known = 2.0 * probe, Between.known(bank, sides, apart=2.0 * probe, mirrored=self._mirrored)
         while True:
             off = self._left(detail, self._interpolated(bank, known, sides))
-            error = self._left(detail, self._blended(known, sides, probe))
+            error = SHARED * self._left(detail, self._blended(known, sides, probe))
             apart, error = _apart(error, probe, allowed=math.sqrt(rest - min(off, BETWEEN * ALLOWED) ** 2))
             if off <= BETWEEN * ALLOWED:
                 return replace(how, apart=apart, blending=error, known=known, between=off)
-            if probe / 2**how.halvings < apart or 4 * known.psfs.nbytes > self.most:
+            if places / 2 < apart or 4 * known.psfs.nbytes > self.most:
                 break
-            known, how = known.refined(bank), replace(how, halvings=how.halvings + 1)
+            places, known = places / 2, known.refined(bank)
         error = self._left(detail, self._blended(bank, sides, probe))
+        apart, better = _apart(SHARED * error, probe, allowed=math.sqrt(rest))
+        if known.psfs.nbytes * (places / apart) ** 2 < self.most:
+            known = Between.known(bank, sides, apart=apart, mirrored=self._mirrored)
+            return replace(how, apart=apart, blending=better, known=known)
         apart, error = _apart(error, probe, allowed=math.sqrt(rest))
         return replace(how, apart=apart, blending=error)
+
+    @property
+    def _mirrored(self) -> bool:
+        """Whether nodes that mirror each other have PSFs that do."""
+        return self.psfs.mirrored and not any(self.centre) and all(m % 2 for m in self.pixels.shape)
 
     def _colours(self, detail: _Detail, sides: tuple[int, int]) -> tuple[float, float]:
         """At how many wavelengths PSFs are computed, and what this leaves."""
@@ -215,7 +239,7 @@ class FieldPicture:
             return every(cell * last) - self.bank(cell * last, colours=count)
 
         for count in self.psfs.fewer_colours:
-            left = self._left(detail, functools.partial(off, count=count))
+            left = self._left(detail, functools.partial(off, count=count), cells=_COLOUR_CELLS)
             if left <= COLOURED * ALLOWED:
                 return count, left
         return math.inf, 0.0
@@ -262,13 +286,13 @@ class FieldPicture:
         return _Detail(patches, float(weight), float(light))
 
     @torch.no_grad()
-    def _left(self, detail: _Detail, deviation: Bank) -> float:
+    def _left(self, detail: _Detail, deviation: Bank, *, cells: tuple[tuple[float, float], ...] = _CELLS) -> float:
         """Of the light where PSFs deviate so from what they should be, rms, relative: in the worst of some cells, on
         the patches of the picture with most detail, for all of its detail.
         """
         before, left = (m // 2 for m in self.pixels.shape)
         worst = uneven = 0.0
-        for cell in _CELLS:
+        for cell in cells:
             off, squares = deviation(torch.tensor([cell], dtype=torch.float64))[0], 0.0
             uneven = max(uneven, float(off.sum((-2, -1)).abs().max()))
             for own, around in detail.patches:

@@ -44,6 +44,11 @@ class SimplerField:
         """Those of the optics."""
         return self.psfs.fewer_colours
 
+    @property
+    def mirrored(self) -> bool:
+        """That of the optics."""
+        return self.psfs.mirrored
+
     def illumination(self, places: Tensor) -> Tensor:
         """That of the optics, or 1 everywhere."""
         return self.psfs.illumination(places) if self.relative_illumination else torch.ones_like(places[..., 0])

@@ -149,6 +149,10 @@ class FieldPSFs(Protocol):
     def fewer_colours(self) -> tuple[int, ...]:
         """How many wavelengths may stand for all, ascending."""
 
+    @property
+    def mirrored(self) -> bool:
+        """Whether PSFs of places that mirror each other in x or y do so too."""
+
     def window(self, pixels: PixelGrid) -> tuple[int, int]:
         """The window (h, w) that holds all but 0.5 % of the light of any place; `pixels.shape` does not count."""
 

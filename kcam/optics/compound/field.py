@@ -87,6 +87,11 @@ class FieldPSFs:
         """How many wavelengths may stand for all."""
         return self._banks.fewer
 
+    @property
+    def mirrored(self) -> bool:
+        """PSFs of places that mirror each other in x or y do so too."""
+        return True
+
     @functools.cached_property
     def _banks(self) -> Banks:
         return Banks(self._bank, self.wavelengths, self.reach)

@@ -48,6 +48,11 @@ class ThinFieldPSFs:
         """How many wavelengths may stand for all."""
         return self._banks.fewer
 
+    @property
+    def mirrored(self) -> bool:
+        """Whether PSFs of places that mirror each other in x or y do so too."""
+        return self._banks.mirrored
+
     @functools.cached_property
     def _banks(self) -> Banks:
         lens = self.query.lens

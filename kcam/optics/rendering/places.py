@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,29 +21,43 @@ _POINTS = 4
 
 @dataclass(frozen=True)
 class Between:
-    """PSFs (Y, X, ...) at rows (Y,) and columns (X,) [pixels from the picture's middle], ascending."""
+    """PSFs at rows (Y,) and columns (X,) [pixels from the picture's middle], ascending.
+
+    psfs: (Y, X, ..., h, w); mirrored: those of rows and columns from the middle on, which the others mirror. spacing:
+    pixels between nodes along y and x that share out what lies between them, see `cubic_weights`.
+    """
 
     rows: Tensor
     columns: Tensor
     psfs: Tensor
+    mirrored: bool = False
+    spacing: tuple[float, float] = (1.0, 1.0)
 
     @classmethod
-    def known(cls, bank: Bank, picture: tuple[int, int], *, apart: float) -> Between:
+    def known(cls, bank: Bank, picture: tuple[int, int], *, apart: float, mirrored: bool = False) -> Between:
         """PSFs at most so many pixels apart."""
         rows, columns = (grid(n, apart=apart) for n in picture)
-        return cls(rows, columns, _computed(bank, rows, columns))
+        return cls(rows, columns, _computed(bank, *(_half(nodes, mirrored) for nodes in (rows, columns))), mirrored)
 
     def refined(self, bank: Bank) -> Between:
         """With those in the middle between them too."""
-        rows, columns = halved(self.rows), halved(self.columns)
-        upper = _woven(self.psfs, _computed(bank, self.rows, columns[1::2]), dim=1)
-        return Between(rows, columns, _woven(upper, _computed(bank, rows[1::2], columns), dim=0))
+        y, x = (_half(nodes, self.mirrored) for nodes in (self.rows, self.columns))
+        between_y, between_x = (_half(middles(nodes), self.mirrored) for nodes in (self.rows, self.columns))
+        psfs = _woven(self.psfs, _computed(bank, y, between_x), (x, between_x), dim=1)
+        both = torch.cat([x, between_x]).sort().values
+        psfs = _woven(psfs, _computed(bank, between_y, both), (y, between_y), dim=0)
+        rows, columns = (torch.cat([nodes, middles(nodes)]).sort().values for nodes in (self.rows, self.columns))
+        return replace(self, rows=rows, columns=columns, psfs=psfs)
+
+    def shared(self, rows: Tensor, columns: Tensor) -> Between:
+        """For nodes at rows and columns that share out what lies between them."""
+        spacing = [float(nodes[1] - nodes[0]) if len(nodes) > 1 else 1.0 for nodes in (rows, columns)]
+        return replace(self, spacing=(spacing[0], spacing[1]))
 
     def middle(self, place: Tensor) -> Tensor:
         """Of the cell around a place (1, 2)."""
-        nodes = (self.columns, self.rows)
-        middles = [(own[1:] + own[:-1]) / 2 if len(own) > 1 else own for own in nodes]
-        return torch.stack([own[(own - at).abs().argmin()] for own, at in zip(middles, place[0], strict=True)])[None]
+        nodes = [middles(own) if len(own) > 1 else own for own in (self.columns, self.rows)]
+        return torch.stack([own[(own - at).abs().argmin()] for own, at in zip(nodes, place[0], strict=True)])[None]
 
     def __call__(self, places: Tensor) -> Tensor:
         """PSFs (N, ...) of places (N, 2), x and y."""
@@ -51,15 +65,27 @@ class Between:
 
     def each(self, places: Tensor) -> Iterator[Tensor]:
         """PSFs of places (N, 2), row by row, one after the other."""
-        across = cubic_weights(self.columns, places[:, 0]).to(self.psfs)
-        along = cubic_weights(self.rows, places[:, 1]).to(self.psfs)
+        along = self._weights(self.rows, places[:, 1], self.spacing[0])
+        across = self._weights(self.columns, places[:, 0], self.spacing[1])
         for _, group in itertools.groupby(range(len(places)), key=places[:, 1].tolist().__getitem__):
             own = list(group)
-            row = _sum(along[own[0]], self.psfs)
+            row = _sum([weights[own[0]] for weights in along], self.psfs, dim=-2)
             if row.requires_grad:  # on the way back each would fill a row of its own with zeros
-                yield from (across[own] @ row.flatten(1)).unflatten(1, row.shape[1:])
+                turned = zip(across, (row, row.flip(-1)), strict=False)
+                yield from sum(weights[own].to(row) @ psfs.flatten(1) for weights, psfs in turned).unflatten(
+                    1, row.shape[1:]
+                )
             else:
-                yield from (_sum(across[index], row) for index in own)
+                yield from (_sum([weights[index] for weights in across], row, dim=-1) for index in own)
+
+    def _weights(self, nodes: Tensor, at: Tensor, spacing: float) -> list[Tensor]:
+        """Of the PSFs that are known, (N, n); mirrored: of these turned about, too."""
+        weights, count = cubic_weights(nodes, at, spacing=spacing), len(nodes)
+        if not self.mirrored:
+            return [weights]
+        turned = weights.flip(1)[:, count // 2 :].clone()
+        turned[:, : count % 2] = 0  # the middle is its own mirror image
+        return [weights[:, count // 2 :], turned]
 
 
 def grid(n: int, *, apart: float) -> Tensor:
@@ -70,49 +96,65 @@ def grid(n: int, *, apart: float) -> Tensor:
     return torch.linspace(-(n - 1) / 2, (n - 1) / 2, count, dtype=torch.float64)
 
 
-def halved(nodes: Tensor) -> Tensor:
-    """Even nodes, and the middles between them."""
-    return _woven(nodes, (nodes[1:] + nodes[:-1]) / 2, dim=0)
+def middles(nodes: Tensor) -> Tensor:
+    """Between neighbours."""
+    return (nodes[1:] + nodes[:-1]) / 2
 
 
-def _sum(weights: Tensor, psfs: Tensor) -> Tensor:
-    """Of PSFs (N, ...) with weights (N,), few of them other than 0."""
-    near = weights.nonzero()[:, 0]
-    few = psfs[int(near[0]) : int(near[-1]) + 1]
-    return (weights[near[0] : near[-1] + 1] @ few.flatten(1)).view(psfs.shape[1:])
+def _half(nodes: Tensor, mirrored: bool) -> Tensor:
+    """Those from the middle on, where they stand for all."""
+    return nodes[len(nodes) // 2 :] if mirrored else nodes
 
 
-def _woven(own: Tensor, between: Tensor, *, dim: int) -> Tensor:
-    """n tensors along a dimension, and n - 1 between them."""
-    if own.shape[dim] == 1:
+def _sum(sides: list[Tensor], psfs: Tensor, *, dim: int) -> Tensor:
+    """Of PSFs (N, ...) with weights (N,), few of them other than 0; those of a second side are turned about `dim`."""
+    found = None
+    for weights, turned in zip(sides, (False, True), strict=False):
+        near = weights.nonzero()[:, 0]
+        if len(near):
+            few = slice(int(near[0]), int(near[-1]) + 1)
+            own = (weights[few].to(psfs) @ psfs[few].flatten(1)).view(psfs.shape[1:])
+            own = own.flip(dim) if turned else own
+            found = own if found is None else found + own
+    assert found is not None  # weights are 1 together
+    return found
+
+
+def _woven(own: Tensor, added: Tensor, nodes: tuple[Tensor, Tensor], *, dim: int) -> Tensor:
+    """Tensors at nodes along a dimension, and others at further ones, in their order."""
+    if not len(nodes[1]):
         return own
-    pairs = torch.stack([own.narrow(dim, 0, between.shape[dim]), between], dim + 1).flatten(dim, dim + 1)
-    return torch.cat([pairs, own.narrow(dim, -1, 1)], dim)
+    return torch.cat([own, added], dim).index_select(dim, torch.cat(nodes).argsort().to(own.device))
 
 
 def _computed(bank: Bank, rows: Tensor, columns: Tensor) -> Tensor:
     """PSFs (Y, X, ...), none of no places. Where gradients are asked for, they are computed again on the way back."""
     if not len(rows) * len(columns):
         return rows.new_empty(0)
-    count = len(rows)
-    found: dict[int, Tensor] = {}
-    for first in range((count + 1) // 2):
-        pair = sorted({first, count - 1 - first})  # rows mirror each other: their PSFs too, where optics are centred
-        places = torch.cartesian_prod(rows[pair], columns).flip(1)
-        psfs = checkpoint(bank, places, use_reentrant=False) if torch.is_grad_enabled() else bank(places)
-        found |= dict(zip(pair, psfs.unflatten(0, (len(pair), -1)), strict=True))
-    return torch.stack([found[row] for row in range(count)])
+    places = [torch.cartesian_prod(row[None], columns).flip(1) for row in rows]
+    again = torch.is_grad_enabled()
+    return torch.stack([checkpoint(bank, own, use_reentrant=False) if again else bank(own) for own in places])
 
 
-def cubic_weights(nodes: Tensor, at: Tensor) -> Tensor:
-    """Weights (N, n) of the cubic through the four of the even nodes (n,) that are next to `at` (N,)."""
+def cubic_weights(nodes: Tensor, at: Tensor, *, spacing: float = 1.0) -> Tensor:
+    """Weights (N, n) of the cubic p through the four of the even nodes (n,) that are next to `at` (N,).
+
+    spacing: pixels a between places that share out what lies between them, linearly. p + (a^2 - 1) p'' / 12 is what
+    these make of p in the mean over the pixels between, so that with p - (a^2 - 1) p'' / 12 they are right in the mean:
+    what is left is 0.4 times as much (rms), of either sign.
+    """
     if len(nodes) == 1:
         return at.new_ones(len(at), 1)
-    position = (at - nodes[0]) / (nodes[1] - nodes[0])
+    step = float(nodes[1] - nodes[0])
+    position = (at - nodes[0]) / step
     first = (position.floor() - 1).clamp(0, len(nodes) - _POINTS)
     own = torch.arange(_POINTS, dtype=at.dtype)
     off = (position - first)[:, None] - own
-    others = [own[own != k].long() for k in range(_POINTS)]
-    weights = torch.stack([(off[:, rest] / (k - own[rest])).prod(1) for k, rest in enumerate(others)], dim=1)
+    bent = (spacing**2 - 1) / 12 / step**2
+    weights = []
+    for k in range(_POINTS):
+        rest = own[own != k].long()
+        scale = (k - own[rest]).prod()
+        weights.append((off[:, rest].prod(1) - bent * 2 * off[:, rest].sum(1)) / scale)
     index = first.long()[:, None] + own.long()
-    return at.new_zeros(len(at), len(nodes)).scatter(1, index, weights)
+    return at.new_zeros(len(at), len(nodes)).scatter(1, index, torch.stack(weights, dim=1))

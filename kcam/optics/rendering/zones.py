@@ -39,13 +39,19 @@ class Axis:
     def of(cls, n: int, window: int, *, apart: float) -> Axis:
         """Nodes at both ends and at most `apart` pixels from the next; of inf one, that stands for all."""
         count = 1 + math.ceil((n - 1) / apart)
-        nodes = (
-            torch.linspace(-(n - 1) / 2, (n - 1) / 2, count, dtype=torch.float64) if n > 1 else torch.zeros(1).double()
-        )
+        end = (n - 1) / 2 if count > 1 else 0.0
+        nodes = torch.linspace(-end, end, count, dtype=torch.float64)
         at = torch.arange(-(window // 2), n + (window - 1) // 2, dtype=torch.float64) - (n - 1) / 2
         weights = linear_weights(nodes, at).T
         own = [row.nonzero()[:, 0] for row in weights]
         return cls(nodes, weights, [int(pixels[0]) for pixels in own], [int(pixels[-1]) + 1 for pixels in own])
+
+    def twins(self, mirrored: bool) -> list[list[int]]:
+        """Nodes that are worked on together: from the middle on, each with the one that mirrors it."""
+        count = len(self.nodes)
+        if not mirrored:
+            return [[index] for index in range(count)]
+        return [sorted({index, count - 1 - index}, reverse=True) for index in range(count // 2, count)]
 
 
 def blend(
@@ -54,50 +60,52 @@ def blend(
     bank: Bank,
     render: Render,
     *,
+    nodes: tuple[Axis, Axis],
     window: tuple[int, int],
-    apart: float,
     border: str,
+    mirrored: bool = False,
 ) -> Tensor:
-    """The picture (B, C, H, W) of planes (B, K, H, W), with PSFs at nodes at most `apart` pixels from the next.
+    """The picture (B, C, H, W) of planes (B, K, H, W), with PSFs at nodes along rows and columns of a window of pixels.
 
-    Two rows of nodes at a time, which mirror each other: their PSFs too, where the optics are centred. Where gradients
-    are asked for, these are computed again on the way back.
+    mirrored: nodes that mirror each other have PSFs that do. Then light is mirrored instead, and one transfer function
+    serves four zones. Where gradients are asked for, a row of zones is computed again on the way back.
     """
-    height, width = picture = (planes.shape[-2], planes.shape[-1])
-    rows, columns = (Axis.of(n, m, apart=apart) for n, m in zip(picture, window, strict=True))
+    height, width = planes.shape[-2:]
+    rows, columns = nodes
     planes = extend(planes, window, border)
     if shares is not None:  # what hides the light of a zone may stand beyond what it reaches
         wide = (4 * window[0], 4 * window[1])
         shares = extend(shares, wide, "replicate" if border == "zero" else border)
 
-    def strips(planes: Tensor, shares: Tensor | None, pair: list[int]) -> list[Tensor]:
-        places = torch.cartesian_prod(rows.nodes[pair], columns.nodes).flip(1)
-        psfs = iter(bank(places))
-        lights = []
-        for row in pair:
-            band, light = planes[..., rows.first[row] : rows.last[row], :], planes.new_zeros(())
-            for column in range(len(columns.nodes)):
-                zone, psf = _Zone(rows, columns, row, column, window), next(psfs)
-                if shares is None:
-                    found = render(psf, zone.cut(band), None, border="dark")
-                else:
-                    found = zone.inside(render(psf, zone.cut_wide(band), zone.cut_shares(shares)))
-                if not column:
-                    light = found.new_zeros(*found.shape[:-1], width + 2 * (window[1] - 1))
-                left = columns.first[column]
-                light[..., left : left + found.shape[-1]] += found
-            lights.append(light[..., window[1] - 1 : window[1] - 1 + width])
-        return lights
+    def strips(planes: Tensor, shares: Tensor | None, own: list[int]) -> list[Tensor]:
+        bands = {row: planes[..., rows.first[row] : rows.last[row], :] for row in own}
+        lights: dict[int, Tensor] = {}
+        of_columns = columns.twins(mirrored)
+        psfs = bank(torch.cartesian_prod(rows.nodes[own[:1]], columns.nodes[[twins[0] for twins in of_columns]]).flip(1))
+        for psf, twins in zip(psfs, of_columns, strict=True):
+            zones = [_Zone(rows, columns, row, column, window) for row in own for column in twins]
+            turns = [[-2] * (zone.row != own[0]) + [-1] * (zone.column != twins[0]) for zone in zones]
+            if shares is None:
+                cut = [zone.cut(bands[zone.row], turn) for zone, turn in zip(zones, turns, strict=True)]
+                found = render(psf, torch.cat(cut), None, border="dark")
+            else:
+                cut = [zone.cut_wide(bands[zone.row], turn) for zone, turn in zip(zones, turns, strict=True)]
+                hidden = [zone.cut_shares(shares).flip(turn) for zone, turn in zip(zones, turns, strict=True)]
+                found = zones[0].inside(render(psf, torch.cat(cut), torch.cat(hidden)))
+            for zone, turn, part in zip(zones, turns, found.split(len(planes)), strict=True):
+                if zone.row not in lights:
+                    lights[zone.row] = part.new_zeros(*part.shape[:-1], width + 2 * (window[1] - 1))
+                left = columns.first[zone.column]
+                lights[zone.row][..., left : left + part.shape[-1]] += part.flip(turn)
+        return [lights[row][..., window[1] - 1 : window[1] - 1 + width] for row in own]
 
     result = planes.new_zeros(())
-    count = len(rows.nodes)
-    for first in range((count + 1) // 2):
-        pair = sorted({first, count - 1 - first})
+    for own in rows.twins(mirrored):
         if torch.is_grad_enabled():
-            lights = checkpoint(strips, planes, shares, pair, use_reentrant=False)
+            lights = checkpoint(strips, planes, shares, own, use_reentrant=False)
         else:
-            lights = strips(planes, shares, pair)
-        for row, light in zip(pair, lights, strict=True):
+            lights = strips(planes, shares, own)
+        for row, light in zip(own, lights, strict=True):
             if not result.ndim:
                 result = light.new_zeros(*light.shape[:-2], height, width)
             top = rows.first[row] - (window[0] - 1)  # of the picture
@@ -108,7 +116,7 @@ def blend(
 
 @dataclass(frozen=True)
 class _Zone:
-    """What one node has a share in."""
+    """What one node has a share in. Where it is cut, it may be turned about some dimensions."""
 
     rows: Axis
     columns: Axis
@@ -116,16 +124,16 @@ class _Zone:
     column: int
     window: tuple[int, int]
 
-    def cut(self, band: Tensor) -> Tensor:
+    def cut(self, band: Tensor, turn: list[int]) -> Tensor:
         """The node's share of its rows of planes, that come with their border, and before it the dark that its PSF
         reaches: around the transform it is that behind it too.
         """
-        return torch.nn.functional.pad(self._own(band), [self.window[1] - 1, 0, self.window[0] - 1, 0])
+        return torch.nn.functional.pad(self._own(band).flip(turn), [self.window[1] - 1, 0, self.window[0] - 1, 0])
 
-    def cut_wide(self, band: Tensor) -> Tensor:
+    def cut_wide(self, band: Tensor, turn: list[int]) -> Tensor:
         """The node's share, and the dark around it, where what hides the light of a zone may stand."""
         sides = [((m - 1) // 2 + m - 1, m // 2 + m - 1) for m in self.window]
-        return torch.nn.functional.pad(self._own(band), [*sides[1], *sides[0]])
+        return torch.nn.functional.pad(self._own(band).flip(turn), [*sides[1], *sides[0]])
 
     def inside(self, light: Tensor) -> Tensor:
         """What the PSF reaches, of the light of `cut_wide`."""
