@@ -76,8 +76,9 @@ class Banks:
         """So many wavelengths, at most all, and what each gives to those that are asked for."""
         if count >= len(self.wavelengths):
             return self.wavelengths, torch.eye(len(self.wavelengths), dtype=torch.float64)
-        nodes = chebyshev_between(*self.wavelengths.aminmax(), int(count))
-        return nodes, lagrange_weights(nodes, self.wavelengths)
+        numbers = 1 / self.wavelengths  # fringes are waves of the wave number: as dense in blue as in red
+        nodes = chebyshev_between(*numbers.aminmax(), int(count))
+        return 1 / nodes, lagrange_weights(nodes, numbers)
 
     def _distinct(
         self, places: Tensor, pixels: PixelGrid, nodes: Tensor, shares: Tensor | None, *, whole: bool

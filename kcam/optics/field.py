@@ -24,7 +24,7 @@ from kcam.optics.source import FieldPSFs, PixelGrid
 ALLOWED = 3e-3
 """Of the picture's light (rms): what nodes may lie apart for, unless Accuracy(spacing=) says how far [pixels]. It is an
 upper bound, of which pictures show a third or less."""
-BETWEEN, COLOURED = 0.75, 0.4  # of that, what PSFs between those that are computed, and between wavelengths, may leave
+BETWEEN, COLOURED = 0.75, 0.6  # of that, what PSFs between those that are computed, and between wavelengths, may leave
 SHARED = 0.4
 """What blending leaves (rms), of what linear windows are off by in the middle between nodes that have their own PSFs:
 see `places.cubic_weights`; 0.3 for what bends along one axis."""

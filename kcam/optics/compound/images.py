@@ -33,6 +33,7 @@ _EDGES = 3  # of these, at which the edges of a pupil are looked at
 _ROOM = 12  # samples of a grid beyond what is open, for the low-pass of its edge
 _ACROSS = 52  # samples across what is open, at least: its edge is spread over twelve
 _AREA_SAMPLES = 128
+_NEARLY = 0.1  # of a clearance: what it is nowhere below takes no light away, also between the points where it is known
 _AT_ONCE = 2**20  # points of pupils, or of images, that are held together
 
 
@@ -97,7 +98,7 @@ def _looked(fitted: PupilFit, nodes: Tensor, directions: Tensor) -> tuple[Tensor
     if not bool(passes.flatten(2).any(2).all()):
         raise ValueError("a point's light is stopped completely. Use smaller fields, or larger semi-diameters.")
     step = r * (2 / (_LOOK - 1))
-    slope = torch.stack(torch.gradient(path, dim=(-2, -1))).square().sum(0).sqrt() / step
+    slope = torch.hypot(*(_steepest(path, passes, dim=dim) for dim in (-2, -1))) / step
     ordered = torch.where(passes, slope, math.inf).flatten(2).sort(dim=2).values
     count = passes.flatten(2).sum(2, keepdim=True)
     rank = ((torch.arange(_SHARES) + 0.5) / _SHARES * count).long()  # each of as many of the rays that pass
@@ -110,6 +111,17 @@ def _looked(fitted: PupilFit, nodes: Tensor, directions: Tensor) -> tuple[Tensor
     half = 2 ** (torch.ceil(16 * torch.log2(half) + 0.5) / 16)  # in steps: it does not follow small changes
     grain = half / 16
     return (((low + high).T / 2) / grain[:, None]).round() * grain[:, None], half, slope, slopes
+
+
+def _steepest(path: Tensor, passes: Tensor, *, dim: int) -> Tensor:
+    """How much a path changes to either neighbour along a dimension, at most, where both are open: beyond an edge it is
+    known less.
+    """
+    n = path.shape[dim]
+    both = passes.narrow(dim, 1, n - 1) & passes.narrow(dim, 0, n - 1)
+    change = torch.where(both, path.diff(dim=dim).abs(), 0.0)
+    none = torch.zeros_like(change.narrow(dim, 0, 1))
+    return torch.maximum(torch.cat([change, none], dim), torch.cat([none, change], dim))
 
 
 def _meridional(x: Tensor, y: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,7 +238,7 @@ def images(
             )
             for own in groups
         ]
-        return torch.cat(found, dim=1)[:, torch.cat(groups).argsort()]
+        return _ordered(found, torch.cat(groups), dim=1)
     colours, weights = _seen_at(wavelengths)
     frame = Frame.of(fitted, directions, nodes[:, colours])
     margin, shortest = max(pixels.shape) // 2 + how.margin, float(wavelengths.min())
@@ -256,7 +268,7 @@ def images(
             path, clearances = _known(fitted, nodes[part], own, spacing * (count / 2), offsets[part])
             chebyshev_points, matrix = (part.to(path.device) for part in _from_chebyshev(fitted.degree, count))
             low = matrix.to(pixels.dtype)
-            openings = Openings(edge_distance(low @ clearances[:, colours].to(pixels.dtype) @ low.mT))
+            openings = Openings(edge_distance(low @ _limiting(clearances[:, colours]).to(pixels.dtype) @ low.mT))
             lights = []
             for index, wavelength in enumerate(wavelengths.tolist()):
                 points_per_pixel = per_pixel * shortest / wavelength
@@ -278,7 +290,23 @@ def images(
                 lights.append(light * factor[:, None, None].to(pixels.dtype))
             found.append(torch.stack(lights, dim=1))
         order += indices
-    return torch.cat(found)[torch.tensor(order).argsort()]
+    return _ordered(found, torch.tensor(order), dim=0)
+
+
+def _limiting(clearances: Tensor) -> Tensor:
+    """Those of clearances (n, E, S, G, G) at Chebyshev points that take light away which all others let pass."""
+    if clearances.shape[2] == 1:
+        return clearances
+    least, second = clearances.detach().topk(2, dim=2, largest=False).values.split(1, dim=2)
+    others = torch.where(clearances.detach() > least, least, second)
+    limits = ((clearances.detach() < _NEARLY) & (others > -_NEARLY)).transpose(0, 2).flatten(1).any(1)
+    return clearances[:, :, limits] if bool(limits.any()) else clearances[:, :, :1]
+
+
+def _ordered(parts: list[Tensor], order: Tensor, *, dim: int) -> Tensor:
+    """Parts along a dimension, put in order: what is in order already is not copied once more."""
+    found = torch.cat(parts, dim) if len(parts) > 1 else parts[0]
+    return found if bool((order.diff() > 0).all()) else found.index_select(dim, order.argsort().to(found.device))
 
 
 def _first(field: Tensor, length: int, count: int) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 _WIDEST, _INTERVALS, _NESTED = 60.0, 16, 4  # degrees; of a search for the edge of the field
 _AIMING = 10  # steps of the secant that aims a chief ray, at most
+_INNER = 0.4  # of the stop's radius: rays that tell how the stop lies in the entrance pupil
 _AIMED = 1e-11  # of the entrance pupil: a last Newton step squares what is left
 _STEP = 1e-3  # of differences in the entrance pupil, of that
 _AIMING_EACH = 60  # at most, of a ray to its point of the stop: a phone's, on a steep stop, takes some 40
@@ -258,14 +259,35 @@ class CompoundLens(nn.Module):
         t, v = heights[:, None, None, None], vergences[None, :, None, None]
         aim, across, along = self.aimed(t, v, indices)
         chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
-        return _Nodes(indices, t, v, aim, across, along, chief)
+        return _Nodes(indices, t, v, aim, across, along, chief, self._towards(t, v, indices, aim, across, along))
+
+    @torch.no_grad()
+    def _towards(self, t: Tensor, v: Tensor, indices: list[Tensor], aim: Tensor, across: Tensor, along: Tensor) -> Tensor:
+        """Where rays cross the entrance pupil that come to (x, y) of the stop, in its radii, about: coefficients of x,
+        y and y^2 behind the chief ray's height, (..., 3) [m]. By rays to points `_INNER` of the radius from its middle.
+        """
+        first = self.first_order()
+        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        beside = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64, device=aim.device)
+        above = torch.tensor([0.0, 1.0, -1.0], dtype=torch.float64, device=aim.device)
+        x, y = _INNER * semi * beside / across, _INNER * semi * above / along
+        rays = trace(
+            self.surfaces,
+            self.launch(t, v, x, aim + y, entrance=first.entrance_pupil),
+            indices,
+            until=self.stop,
+        )
+        up, down = rays.y[..., 1:2], rays.y[..., 2:]
+        slope, bend = (up - down) / (2 * y[..., 1:2]), (up + down) / (2 * y[..., 1:2] ** 2)
+        straight = semi / torch.cat([rays.x[..., :1] / x[..., :1], slope], dim=-1)
+        curved = torch.cat([straight, -bend / slope * straight[..., 1:] ** 2], dim=-1)
+        linear = torch.cat([semi / across, semi / along, torch.zeros_like(along)], dim=-1)
+        return torch.where(rays.alive.all(-1, keepdim=True), curved, linear)
 
     def _at_sensor(self, rays: Rays, indices: list[Tensor]) -> Rays:
         rays = trace(self.surfaces, rays, indices)
         t = float64(self.sensor_distance).to(rays.x.device) / rays.dz
-        return Rays(
-            rays.x + t * rays.dx, rays.y + t * rays.dy, rays.dx, rays.dy, rays.path + t, rays.alive, rays.clearance
-        )
+        return replace(rays, x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, path=rays.path + t)
 
     def opd(
         self,
@@ -313,15 +335,14 @@ class CompoundLens(nn.Module):
     def pupils(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> pupil.PupilFit:
         """Pupils of F x Z x L nodes, in this order: heights (F,) >= 0, vergences (Z,) [1/m], wavelengths (L,) [m]."""
         nodes = self._nodes(wavelengths, vergences, heights)
-        semi = float64(self.surfaces[self.stop].semi_diameter).detach()  # type: ignore[arg-type]
-        x, y = pupil.rays_over_stop(heights.device)
-        px, py = x * (semi / nodes.across.abs()), nodes.aim + y * (semi / nodes.along.abs())
+        x, y, area = pupil.rays_over_stop(heights.device)
+        px, py = nodes.towards(x, y)
         chief = nodes.chief
         rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
         wavefront = rays.path - rays.dx * rays.x - rays.dy * (rays.y - chief.y) - chief.path
-        clearances = torch.stack(rays.clearance, dim=-2)
+        clearances = torch.stack([*rays.clearance, rays.margin], dim=-2)  # type: ignore[list-item]
         flat = [part.flatten(0, 2) for part in (rays.dx, rays.dy, wavefront, clearances, rays.alive, chief.y[..., 0])]
-        return pupil.fit(*flat, enough=pupil.ENOUGH * float(wavelengths.min()))
+        return pupil.fit(*flat, area=area, enough=pupil.ENOUGH * float(wavelengths.min()))
 
     # ---- images of points ------------------------------------------------------------------------------------------
 
@@ -722,9 +743,8 @@ class CompoundLens(nn.Module):
         asked = self._asked([self.focus_wavelength], distance, analysis.upwards(heights))
         with torch.no_grad():
             nodes = self._nodes(asked.wavelengths, asked.vergences, asked.heights)
-            semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
-            across = torch.linspace(-1.2, 1.2, 241, dtype=torch.float64) * semi / nodes.along.abs()
-            rays = self.launch(nodes.heights, nodes.vergences, torch.zeros_like(across), nodes.aim + across)
+            px, py = nodes.towards(torch.zeros(241).double(), torch.linspace(-1.2, 1.2, 241, dtype=torch.float64))
+            rays = self.launch(nodes.heights, nodes.vergences, px, py)
             landed = self._at_sensor(rays, nodes.indices)
             passes = landed.alive & (torch.stack(landed.clearance) > 0).all(0)
             kept = analysis.evenly(passes[:, 0, 0], count)
@@ -760,10 +780,9 @@ class CompoundLens(nn.Module):
     def _sent(self, nodes: _Nodes, rings: int) -> tuple[Rays, Tensor]:
         """Rays over the stop, at the sensor, and the light of each, (F, Z, L, R): see `analysis.light`."""
         x, y, area = analysis.hexapolar(rings)
-        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
         beside = analysis.STEP * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
         x, y = (part + step[:, None, None, None, None] for part, step in zip((x, y), beside, strict=True))
-        px, py = x * (semi / nodes.across.abs()), nodes.aim + y * (semi / nodes.along.abs())
+        px, py = nodes.towards(x, y)
         rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
         return analysis.first(rays), analysis.light(rays, area)
 
@@ -805,8 +824,8 @@ class _Asked:
 @dataclass(frozen=True)
 class _Nodes:
     """What rays to F x Z x L nodes start from: heights, vergences and indices as they broadcast against rays (..., R);
-    where chief rays cross the entrance pupil, and how the stop follows it there: see `CompoundLens.aimed`; and the
-    chief rays at the sensor, (F, Z, L, 1).
+    where chief rays cross the entrance pupil, and how the stop follows it there: see `CompoundLens.aimed`; the chief
+    rays at the sensor, (F, Z, L, 1); and what leads to places of the stop, (F, Z, L, 3): see `CompoundLens._towards`.
     """
 
     indices: list[Tensor]
@@ -816,3 +835,9 @@ class _Nodes:
     across: Tensor
     along: Tensor
     chief: Rays
+    stop: Tensor
+
+    def towards(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Where rays that come to (x, y) of the stop, in its radii, cross the entrance pupil, about: px and py [m]."""
+        beside, above, bent = self.stop.split(1, dim=-1)
+        return x * beside.abs(), self.aim + y * above.abs() + y**2 * bent

@@ -23,16 +23,20 @@ ENOUGH = 2e-4  # of a wavelength: what a fit of a wavefront may leave (rms)
 _FEWEST = 12  # rays that pass
 _FEW_NODES = 4
 _LESS = 12.0  # exponent of the weight for a clearance below 0
-_FAR = -0.3  # clearance of rays that are left out: they may come from anywhere, and widen what is fitted
+_FAR = -0.3  # clearance of rays that are left out: they may come from anywhere
+_GRAZING = 0.1  # margin of rays that pass: beyond them others may end, which no clearance tells
+_SOFT = 0.2  # of clearance, over which the edge of what is open is spread where its extent is taken
+_EXTENT = 2.0  # times the standard deviation of what is open: the rim of an ellipse
+_KNOWN = 1.15  # extents: rays are fitted, and pupils may be open, up to there
 OVERFILL = 1.12  # of the stop's radius, to which rays are sent: seen from off the axis the stop is no ellipse
-_RINGS, _SPOKES = 21, 49
+_RINGS, _SPOKES = 17, 41
 
 
 @dataclass(frozen=True)
 class PupilFit:
     """Pupils of N nodes as polynomials.
 
-    degree: of the polynomials. centre (N,): c; half_width (N, 2): a and b, within which there are rays. wavefront:
+    degree: of the polynomials. centre (N,): c; half_width (N, 2): a and b, about those of what is open. wavefront:
     coefficients (N, T) [m]. clearances: (N, S, T). chief: where the chief ray lands, (N,) [m]. residual: rms of the fit
     of the wavefront within the open part, (N,) [m].
     """
@@ -72,16 +76,19 @@ class PupilFit:
         full[:, :, rows, columns] = table
         values = torch.einsum("nsji,jn...,in...->ns...", full, along, across)
         # beyond the rays nothing is known, and nothing open
-        inside = 1 - u**2 - v**2
+        inside = 1 - (u**2 + v**2) / _KNOWN**2
         return values[:, 0], torch.cat([values[:, 1:], inside[:, None]], dim=1)
 
 
-def rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Coordinates x >= 0, y in a disc a little larger than 1, (R,) each: rings at Chebyshev radii, all spokes."""
-    radius = OVERFILL * chebyshev_points(2 * _RINGS)[:_RINGS].to(device)
+def rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates x >= 0, y in a disc a little larger than 1, and the area that each stands for, up to a factor, (R,)
+    each: rings at Chebyshev radii, all spokes.
+    """
+    share = chebyshev_points(2 * _RINGS)[:_RINGS].to(device)
     angle = torch.linspace(0, math.pi, _SPOKES, dtype=torch.float64, device=device)
-    x, y = radius[:, None] * angle.sin(), radius[:, None] * angle.cos()
-    return x.flatten().clamp(min=0), y.flatten()
+    x, y = OVERFILL * share[:, None] * angle.sin(), OVERFILL * share[:, None] * angle.cos()
+    area = (share * torch.sqrt(1 - share**2))[:, None].expand_as(x)
+    return x.flatten().clamp(min=0), y.flatten(), area.flatten()
 
 
 @functools.cache
@@ -105,9 +112,11 @@ def fit(
     alive: Tensor,
     chief: Tensor,
     *,
+    area: Tensor,
     enough: float,
 ) -> PupilFit:
-    """Least squares over rays (N, R); clearances (N, S, R). enough: residual of the wavefront [m].
+    """Least squares over rays (N, R); clearances (N, S, R), the last of them what falls to 0 where rays end. enough:
+    residual of the wavefront [m].
 
     Rays that no light follows count less the farther outside they are, but they do: beyond its data a polynomial may
     be anything, a clearance above 0 too.
@@ -121,14 +130,18 @@ def fit(
                 f"only {int(passed.min())} of {dx.shape[1]} rays of a point pass this lens, too few to know its pupil. "
                 "Is the field too wide, or a semi_diameter too small?"
             )
-        alive = alive & (least > _FAR)
-        weights = torch.exp(_LESS * least.clamp(max=0)).clamp(min=1e-3) * alive
-        low, high = torch.where(alive, dy, math.inf).amin(1), torch.where(alive, dy, -math.inf).amax(1)
-        half = torch.stack([torch.where(alive, dx.abs(), 0.0).amax(1), (high - low) / 2], dim=1).clamp(min=1e-9)
-        centre = (low + high) / 2
+        shares = torch.sigmoid(least / _SOFT) * area * alive
+        shares = shares / shares.sum(1, keepdim=True)
+        centre = (shares * dy).sum(1)
+        square = torch.stack([dx**2, (dy - centre[:, None]) ** 2], dim=1)
+        half = _EXTENT * (shares[:, None] * square).sum(2).sqrt().clamp(min=1e-9)
         others = least[:, None].expand_as(clearances)  # surfaces that clip nothing that the rest lets pass are left out
         clips = ((clearances <= others + 1e-12) & (others < 0.02) & (others > _FAR)).any(0).any(1)
+        clips[-1] |= bool(((least > 0) & (clearances[:, -1] < _GRAZING)).any())
     u, v = dx / half[:, :1], (dy - centre[:, None]) / half[:, 1:]
+    with torch.no_grad():
+        weights = torch.exp(_LESS * least.clamp(max=0)) * (1 - least / _FAR).clamp(0, 1)
+        weights = weights * (alive & (u**2 + v**2 < _KNOWN**2))
     data = torch.cat([wavefront[:, None], clearances[:, clips]], dim=1).mT
 
     def fitted(degree: int, own: Tensor | slice) -> tuple[Tensor, Tensor]:

@@ -22,8 +22,8 @@ from kcam.optics.numerics import chebyshev_between, chebyshev_points, lagrange_p
 Fitted = Callable[[Tensor, Tensor, Tensor], PupilFit]
 """Pupils of F x Z x L nodes: heights (F,), vergences (Z,), wavelengths (L,)."""
 
-DEVIATION = 2e-3  # that a table may have: of a PSF's light, about
-_HEIGHTS = (6, 9, 13, 19, 28)
+DEVIATION = 3e-3  # that a table may have: of a PSF's light, about
+_HEIGHTS = (6, 10, 17, 28)
 _OTHERS = (3, 5, 8)  # wavelengths, vergences
 _ALL = 4  # so many values are nodes themselves
 _BEYOND = 1.01  # of the largest height

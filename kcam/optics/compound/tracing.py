@@ -25,7 +25,7 @@ class Rays:
     """Rays at a plane: positions x, y [m], direction cosines dx, dy towards +x, +y, and the optical path so far [m].
 
     alive: whether it has met every surface. clearance: for each clipping surface 1 - r^2 / R^2, below 0 where it does
-    not pass.
+    not pass. margin: the least of what falls to 0 where surfaces end and where rays graze them, to be totally reflected.
     """
 
     x: Tensor
@@ -35,6 +35,7 @@ class Rays:
     path: Tensor
     alive: Tensor
     clearance: tuple[Tensor, ...] = ()
+    margin: Tensor | None = None
 
     @property
     def dz(self) -> Tensor:
@@ -57,7 +58,7 @@ def trace(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], *,
     Source: Spencer and Murty, J. Opt. Soc. Am. 52, 672 (1962).
     """
     x, y, dx, dy, path, alive = rays.x, rays.y, rays.dx, rays.dy, rays.path, rays.alive
-    z, clearance = torch.zeros_like(x), []
+    z, clearance, margin = torch.zeros_like(x), [], torch.ones_like(x)
     last = len(surfaces) - 1
     for k, surface in enumerate(surfaces):
         dz = _along(dx, dy)
@@ -70,13 +71,14 @@ def trace(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], *,
             clearance.append(1 - r2 / float64(surface.semi_diameter).to(r2.device) ** 2)
         if k == until:
             return Rays(x, y, dx, dy, path, alive, tuple(clearance))
-        dx, dy, passes = _refracted(dx, dy, dz, x, y, slope, indices[k], indices[k + 1])
+        dx, dy, passes, grazing = _refracted(dx, dy, dz, x, y, slope, indices[k], indices[k + 1])
+        margin = torch.minimum(margin, torch.minimum(inside, grazing))
         alive = alive & passes
         x, y, z, dx, dy = (torch.where(alive, v, torch.zeros_like(v)) for v in (x, y, z, dx, dy))
         if k < last:
             z = z - float64(surface.thickness).to(z.device)
     t = -z / _along(dx, dy)
-    return Rays(x + t * dx, y + t * dy, dx, dy, path + indices[-1] * t, alive, tuple(clearance))
+    return Rays(x + t * dx, y + t * dy, dx, dy, path + indices[-1] * t, alive, tuple(clearance), margin)
 
 
 def _met(
@@ -104,8 +106,10 @@ def _met(
 
 def _refracted(
     dx: Tensor, dy: Tensor, dz: Tensor, x: Tensor, y: Tensor, slope: Tensor, before: Tensor, behind: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions behind a surface by Snell's law, and which are not totally reflected."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Directions behind a surface by Snell's law, which are not totally reflected, and how far they are from it: the
+    squared cosine to the normal.
+    """
     gx, gy = -2 * slope * x, -2 * slope * y  # the normal is (gx, gy, 1) / length
     length = torch.sqrt(1 + gx**2 + gy**2)
     cosine = (dx * gx + dy * gy + dz) / length
@@ -113,7 +117,7 @@ def _refracted(
     squared = 1 - ratio**2 * (1 - cosine**2)
     turned = (torch.sqrt(squared.clamp(min=1e-9)) - ratio * cosine) / length
     passes = (squared.detach() > 0) & (cosine.detach() > 0)
-    return ratio * dx + turned * gx, ratio * dy + turned * gy, passes
+    return ratio * dx + turned * gx, ratio * dy + turned * gy, passes, squared
 
 
 def system_matrix(surfaces: Sequence[Surface], indices: Sequence[Tensor], *, refract_last: bool = True) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcam.optics.autograd import apply_linear
 from kcam.optics.propagation import sampling
-from kcam.optics.pupil.quadrants import by_x, join, join_adjoint, parities
+from kcam.optics.pupil.quadrants import by_x, join, join_adjoint, parities, split
 
 _FEW = 2**17  # points below which two plain products are faster than their parts by parity
 
@@ -37,6 +37,8 @@ class Pixels:
     def of_image(self, image: Tensor) -> Tensor:
         """(..., H, W) of the intensity (..., 2K + 1, 2K + 1)."""
         reach = image.shape[-1] // 2
+        if self.integrate and image.shape[-1] ** 2 >= _FEW:
+            return self.of_quadrants(split(image))
         if self.integrate:
             pixels = apply_linear(image, _Products(*(_box(n, **self._how(reach, image)) for n in self.shape)))
             return self._scaled(pixels, lambda same: same.of_image(image))
