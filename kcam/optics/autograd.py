@@ -50,6 +50,51 @@ def apply_linear(values: Tensor, linear: LinearMap) -> Tensor:
     return _Apply.apply(values, linear, False)
 
 
+class _Cut(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, places):
+        ctx.shape, ctx.places = values.shape, places
+        return tuple(values[(..., *place)] for place in places)
+
+    @staticmethod
+    def backward(ctx, *grads):
+        whole = next(grad for grad in grads if grad is not None).new_zeros(ctx.shape)
+        for grad, place in zip(grads, ctx.places, strict=True):
+            whole = add_at(whole, grad, place)
+        return whole, None
+
+
+class _AddAt(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, whole, part, place):
+        ctx.mark_dirty(whole)
+        ctx.place = place
+        whole[(..., *place)] += part
+        return whole
+
+    @staticmethod
+    def backward(ctx, grad):
+        return grad, grad[(..., *ctx.place)], None
+
+
+Place = tuple[slice, slice]
+"""Rows and columns of a picture."""
+
+
+def cut(values: Tensor, places: list[Place]) -> tuple[Tensor, ...]:
+    """Parts of values (..., H, W), not to be changed. On the way back all are added up in one tensor: of slices each
+    would fill a whole one with zeros.
+    """
+    return _Cut.apply(values, places)
+
+
+def add_at(whole: Tensor, part: Tensor, place: Place) -> Tensor:
+    """The whole (..., H, W) with a part added to it in place. The way back takes its gradient as it is: of a slice that
+    is changed in place it would copy the whole.
+    """
+    return _AddAt.apply(whole, part, place)
+
+
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
     """For `backward(ctx, saved, *grads)` of a Function: a second derivative through it is a RuntimeError.
 

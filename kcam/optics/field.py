@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from kcam.optics.rendering.borders import part
 from kcam.optics.rendering.places import Bank, Between
@@ -31,6 +32,7 @@ see `places.cubic_weights`; 0.3 for what bends along one axis."""
 _FINEST, _COARSEST = 4, 512  # pixels between nodes
 _PATCH, _PATCHES = 96, 4  # on which the error is estimated: their side [pixels], and how many
 PROBE = 128  # pixels between the places that are tried
+_TOGETHER = 2**17  # pixels of PSFs of places, for each wavelength, whose graph is held
 _SAMPLED = 2**18  # pixels by which a picture's light is known
 _CELLS = ((0.12, 0.09), (0.45, 0.4), (0.68, 0.74), (0.97, 0.94))  # places of the quadrant, of half its sides
 _COLOUR_CELLS = _CELLS[1::2]
@@ -195,7 +197,18 @@ class FieldPicture:
         return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
 
     def _of(self, colours: float | None) -> Bank:
-        return functools.partial(self.bank, colours=colours)
+        """The bank of so many wavelengths. Where gradients are asked for, a few PSFs at a time are computed again on the
+        way back.
+        """
+        own = functools.partial(self.bank, colours=colours)
+
+        def bank(places: Tensor) -> Tensor:
+            if not torch.is_grad_enabled():
+                return own(places)
+            few = places.split(max(1, _TOGETHER // math.prod(self.pixels.shape)))
+            return torch.cat([checkpoint(own, part, use_reentrant=False) for part in few])
+
+        return bank
 
     def how(self, planes: Tensor, shares: Tensor | None) -> _How:
         """How densely PSFs are computed, and nodes lie, for `ALLOWED`: planes as they were moved."""

@@ -57,6 +57,12 @@ def _checked_centre(centre: tuple[float, float]) -> tuple[float, float]:
     return float(numbers[0]), float(numbers[1])
 
 
+def _within(window: tuple[int, int], picture: tuple[int, int]) -> tuple[int, int]:
+    """A window no larger than the picture, or one pixel so that it has a middle."""
+    height, width = (min(side, n + (n + 1) % 2) for side, n in zip(window, picture, strict=True))
+    return height, width
+
+
 class Imaging(Stage):
     """The light of a scene through a lens onto the pixels.
 
@@ -209,12 +215,9 @@ class Imaging(Stage):
         if self.accuracy.psf_shape is not None:
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
-        if self.varies:
-            window = self._traced(picture, vergences, wavelengths).window(pixels)
-        else:
-            window = self.lens.window(Points(vergences), wavelengths, pixels)
-        height, width = (min(side, n + (n + 1) % 2) for side, n in zip(window, picture, strict=True))
-        return height, width
+        if not self.varies:
+            return _within(self.lens.window(Points(vergences), wavelengths, pixels), picture)
+        return _within(self._traced(picture, vergences, wavelengths).window(pixels), picture)
 
     def depth_layers(self, depth: Tensor, wavelengths: Tensor, *, waves: float = LAYER_WAVES) -> Tensor:
         """Vergences of the layers that a depth map is cut into, ascending (Z,) [1/m].
@@ -433,9 +436,7 @@ class Imaging(Stage):
         groups = len(self._psf_wavelengths(scene.wavelengths))
         computed = float(min(groups, _COLOURS))
         colours = 4.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
-        sides = [
-            min(n, math.ceil(2 * n / max(1, k - 1))) + m - 1 for n, m, k in zip(picture, window, nodes, strict=True)
-        ]
+        sides = [min(n, math.ceil(2 * n / max(1, k - 1))) for n, k in zip(picture, nodes, strict=True)]
         shaped = functools.partial(planes.new_empty, device="meta")
         factored = scene.spectra is not None or count < planes.shape[1]
         border = "dark" if layers == 1 else "zero"
@@ -473,13 +474,13 @@ class Imaging(Stage):
         afterwards = None
         if shares is not None and self.accuracy.per_band:
             weights, afterwards = None, weights
-        window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         if self.varies:
             learns = has_derivative((self.lens, planes, shares, spectra, vergences, weights))
             with torch.set_grad_enabled(learns and torch.is_grad_enabled()):  # else nothing is to be kept for it
-                field = self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes)
+                field = self._field_picture(scene, vergences=vergences, weights=weights, like=planes)
                 light = field.light(planes, shares)
             return self._finished(light, weights, afterwards)
+        window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         length = self._layers_at_once(bands, window, planes)
         light = planes.new_zeros(())
         for position, own in self._zones(planes):
@@ -524,14 +525,16 @@ class Imaging(Stage):
         own._reach = reach
         return own
 
-    def _over_field(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
+    def _over_field(
+        self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor, *, traced: FieldPSFs | None = None
+    ) -> FieldPSFs:
         """PSFs of all places of a picture, traced once for all ways to group the wavelengths."""
         grouped, lateral = self._psf_wavelengths(wavelengths), self.accuracy.lateral_colour
         corner = self.reach(picture) if self._reach is None else self._reach
 
         def build() -> FieldPSFs:
-            traced = self._traced(picture, vergences, wavelengths)
-            return traced.at_wavelengths(grouped, lateral_colour=lateral)
+            found = self._traced(picture, vergences, wavelengths) if traced is None else traced
+            return found.at_wavelengths(grouped, lateral_colour=lateral)
 
         key = (self.lens, corner, vergences, wavelengths, grouped, lateral)
         return self._field_cache.get(key, build)
@@ -546,9 +549,11 @@ class Imaging(Stage):
         )
 
     def _field_picture(
-        self, scene: Scene, *, vergences: Tensor, window: tuple[int, int], weights: Tensor | None, like: Tensor
+        self, scene: Scene, *, vergences: Tensor, weights: Tensor | None, like: Tensor
     ) -> FieldPicture:
         picture = (scene.shape[-2], scene.shape[-1])
+        traced = self._traced(picture, vergences, scene.wavelengths)
+        window = self.accuracy.psf_shape or _within(traced.window(self.pixels((1, 1), like)), picture)
         spectra = None if scene.spectra is None else scene.spectra.to(like)
         rendering = self._rendering(scene) | {"border": "zero", "cache": None, "weights": weights, "spectra": spectra}
         mixing, mixed = None, False
@@ -564,7 +569,7 @@ class Imaging(Stage):
                     torch.eye(channels).repeat_interleave(count, 1),
                 )
                 rendering |= {"spectra": of_plane.to(like), "weights": of_channel.to(like), "owner": None}
-        psfs = self._over_field(picture, vergences, scene.wavelengths)
+        psfs = self._over_field(picture, vergences, scene.wavelengths, traced=traced)
 
         def render(
             bank: Tensor,
@@ -630,13 +635,7 @@ class Imaging(Stage):
         planes = self.working(scene)
         weights = None if colour_filter is None else colour_filter.contraction(scene.wavelengths).to(planes)
         vergences, shares = self.layers_of(scene, planes)
-        picture = (planes.shape[-2], planes.shape[-1])
-        window = self.psf_window(scene.wavelengths, vergences=vergences, picture=picture)
-        return (
-            self._field_picture(scene, vergences=vergences, window=window, weights=weights, like=planes),
-            planes,
-            shares,
-        )
+        return self._field_picture(scene, vergences=vergences, weights=weights, like=planes), planes, shares
 
     def _zones(self, planes: Tensor) -> Iterator[tuple[Tensor | None, Tensor]]:
         """Positions on the sensor (1, 2) [m] at which the optics know their PSFs, and what of the light falls there."""

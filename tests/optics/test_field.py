@@ -129,9 +129,7 @@ def truth(imaging: optics.Imaging, light: Tensor, window: tuple[int, int]) -> Te
     height, width = light.shape[-2:]
     scene = scene_of(light)
     weights = torch.eye(light.shape[1], dtype=DOUBLE)
-    field = imaging._field_picture(
-        scene, vergences=torch.ones(1, dtype=DOUBLE), window=window, weights=weights, like=light
-    )
+    field = imaging._field_picture(scene, vergences=torch.ones(1, dtype=DOUBLE), weights=weights, like=light)
     planes, _ = field.moved(light, None)
     y, x = (torch.arange(n, dtype=DOUBLE) - (n - 1) / 2 for n in (height, width))
     m, n = (side // 2 for side in window)

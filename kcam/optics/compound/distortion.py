@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from kcam.optics.numerics import chebyshev, chebyshev_points
 
 _SMALL = 1e-11  # of the sum: terms that move light by less are left out
 _NODES = 16
+_MANY = 2**14  # places
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,12 @@ class Even:
         return cls(found[: int(significant.max()) + 1], reach)
 
     def at(self, squared_radii: Tensor) -> Tensor:
-        """At squared radii [m^2]."""
+        """At squared radii [m^2]. Where gradients are asked for at many, it is computed again on the way back."""
+        if torch.is_grad_enabled() and squared_radii.numel() > _MANY:
+            return checkpoint(self._sum, squared_radii, use_reentrant=False)
+        return self._sum(squared_radii)
+
+    def _sum(self, squared_radii: Tensor) -> Tensor:
         v = (2 / self.reach**2) * squared_radii - 1
         after, last = torch.zeros_like(v), torch.zeros_like(v)
         for coefficient in self.coefficients.flip(0)[:-1]:  # Clenshaw's recurrence

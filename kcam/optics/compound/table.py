@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from kcam.optics.compound.images import Frame, areas
 from kcam.optics.compound.pupil import PupilFit, odd_terms
@@ -72,16 +73,20 @@ def tabulate(fitted: Fitted, *, highest: float, vergences: Tensor, wavelengths: 
     between them are within `DEVIATION`, or there are no more.
     """
     counts = [0, 0, 0]
-    while True:
-        table = _table(fitted, highest, vergences, wavelengths, counts)
-        with torch.no_grad():
+    with torch.no_grad():
+        while True:
+            table = _table(fitted, highest, vergences, wavelengths, counts)
             off = [_hidden(fitted, table, axis) if _grows(table, counts, axis) else 0.0 for axis in range(3)]
-        table = replace(table, deviation=max(off))
-        worse = [axis for axis in range(3) if off[axis] > DEVIATION and counts[axis] + 1 < len(_steps(axis))]
-        if not worse:
-            return table
-        for axis in worse:
-            counts[axis] += 1
+            table = replace(table, deviation=max(off))
+            worse = [axis for axis in range(3) if off[axis] > DEVIATION and counts[axis] + 1 < len(_steps(axis))]
+            if not worse:
+                break
+            for axis in worse:
+                counts[axis] += 1
+    if not torch.is_grad_enabled():
+        return table
+    traced = checkpoint(_table, fitted, highest, vergences, wavelengths, counts, use_reentrant=False)
+    return replace(traced, deviation=table.deviation)
 
 
 _NODES = ("heights", "vergences", "wavelengths")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 BORDERS = ("reflect", "replicate", "periodic", "zero")
-"""Those that users choose. "dark" is that of planes which come with window - 1 dark pixels before their first ones."""
+"""Those that users choose. "dark" has window - 1 dark pixels on both sides: all that the window reaches is seen."""
 
 
 def extend(planes: Tensor, window: tuple[int, int], border: str) -> Tensor:
@@ -22,7 +22,7 @@ def extend_along(planes: Tensor, window: int, border: str, *, dim: int, length: 
     """`extend` along one axis, dim -2 or -1; to a length, a border other than zeros goes on up to there."""
     n, before, after = planes.shape[dim], window // 2, (window - 1) // 2
     if border == "dark":
-        before, after = 0, window - 1
+        before, after = window - 1, window - 1
     if length is not None and border not in ("zero", "dark"):
         after = length - before - n
     return part(planes, -before, n + after, border, dim=dim)

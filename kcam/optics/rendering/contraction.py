@@ -39,12 +39,11 @@ class Contraction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, planes, psfs, spectra, weights, kept, convolution):
-        height, width = convolution.picture
         parts = convolution.parts(len(psfs), len(planes))
         spectra_of_all = planes.shape[:2].numel() * (1 if spectra is None else len(parts))
         hold = any(ctx.needs_input_grad[1:4]) and spectra_of_all <= convolution.held
         held = []
-        result = convolution.room(planes, len(planes), len(weights), height)
+        result = convolution.room(planes, len(planes), len(weights), convolution.seen[0])
         for part in parts:
             bands = _Bands(convolution, part, planes, psfs, spectra, kept)
             for strip in bands.strips():
@@ -53,10 +52,10 @@ class Contraction(torch.autograd.Function):
                     own = bands.columns(b, strip)
                     held += [own] if hold else []
                     mixed = _mixed(weights[:, part], bands.light(own) * transfers)
-                    _put(total[..., strip], convolution.back_columns(mixed, height), add=part.start > 0)
+                    _put(total[..., strip], convolution.seen_columns(mixed), add=part.start > 0)
         ctx.save_for_backward(planes, psfs, spectra, weights, kept, *held)
         ctx.convolution = convolution
-        picture = convolution.back_rows(result, width)
+        picture = convolution.seen_rows(result)
         return picture.clone(memory_format=torch.contiguous_format)  # of a view, nothing could be changed in place
 
     @staticmethod
@@ -71,7 +70,7 @@ class Contraction(torch.autograd.Function):
         d_planes = torch.empty_like(planes) if need_planes else None
         d_rows = convolution.room(planes, *planes.shape[:-1]) if need_planes and spectra is not None else None
         with full_precision(grad.device):
-            onto_rows = convolution.conjugate_rows(grad)
+            onto_rows = convolution.conjugate_rows(convolution.unseen(grad))
             for part in convolution.parts(len(psfs), len(planes)):
                 bands = _Bands(convolution, part, planes, psfs, spectra, kept)
                 if d_planes is not None and spectra is None:  # bands of a part are planes of its own
@@ -102,9 +101,9 @@ class Contraction(torch.autograd.Function):
                             elif need_psfs:
                                 d_transfers = light * d_product
                     if d_psf_rows is not None:
-                        d_psf_rows[..., strip] = convolution.back_columns(d_transfers, psfs.shape[-2])
+                        d_psf_rows[..., strip] = convolution.kernel_columns(d_transfers)
                 if d_psfs is not None:
-                    d_psfs[part] = convolution.back_rows(d_psf_rows, psfs.shape[-1])
+                    d_psfs[part] = convolution.kernel_rows(d_psf_rows)
                 if d_planes is not None and spectra is None:
                     d_planes[:, part] = convolution.rows_adjoint(d_rows)
             if d_planes is not None and spectra is not None:

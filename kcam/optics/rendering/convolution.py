@@ -25,11 +25,13 @@ class Convolution:
     The picture is upright, which turns the PSF by 180 degrees: a correlation, so transfer functions are conjugated,
     and the window's origin needs no shift: the picture is extended by window // 2 before its first pixel.
     Half spectra are (..., F, rows), F = columns // 2 + 1: what is transformed last lies in lines of memory.
+    In the dark it is all that the window reaches that is seen, window - 1 pixels before the picture too: these come out
+    at the end of a transform.
     """
 
     picture: tuple[int, int]
     window: tuple[int, int]
-    border: str  # one of BORDERS, "dark", or "given": the planes come with what lies around them
+    border: str  # one of BORDERS, "dark", or "given": planes come with what lies around them
     size: tuple[int, int]
     bands: int  # planes whose half spectra fit into a quarter of the memory
     held: int  # planes whose spectra may wait for the backward pass
@@ -51,14 +53,18 @@ class Convolution:
         """
 
         def reached(m: int) -> int:
-            if border == "dark":
-                return 0  # around the transform it lies on both sides
             return m // 2 if border == "zero" else m - 1  # zeros may share their place with those before the picture
 
         rows, columns = (fast_length(max(m, n + reached(m))) for n, m in zip(picture, window, strict=True))
         quarter = int(max_memory // (4 * rows * columns * itemsize))
         held = 0 if border == "given" else quarter // layers
         return cls(picture, window, border, (rows, columns), max(1, quarter), held)
+
+    @property
+    def seen(self) -> tuple[int, int]:
+        """Pixels of the result."""
+        beyond = [m - 1 if self.border == "dark" else 0 for m in self.window]
+        return self.picture[0] + beyond[0], self.picture[1] + beyond[1]
 
     def parts(self, count: int, batch: int) -> list[slice]:
         """So many bands of so many pictures, as many at once as there is room for."""
@@ -130,16 +136,41 @@ class Convolution:
 
     def back(self, spectrum: Tensor) -> Tensor:
         """The picture of a half spectrum."""
-        height, width = self.picture
-        return in_cache(lambda part: self.back_rows(self.back_columns(part, height), width), spectrum)
+        return in_cache(lambda part: self.seen_rows(self.seen_columns(part)), spectrum)
 
-    def back_columns(self, spectra: Tensor, height: int) -> Tensor:
-        """The first `height` rows of a strip of columns; no others go on to the second transform."""
-        return torch.fft.ifft(spectra)[..., :height].mT
+    def seen_columns(self, spectra: Tensor) -> Tensor:
+        """The rows of the result, of a strip of columns; no others go on to the second transform."""
+        return self._seen(torch.fft.ifft(spectra), axis=0).mT
 
-    def back_rows(self, rows: Tensor, width: int) -> Tensor:
-        """The first `width` pixels of each row."""
-        return in_cache(lambda part: torch.fft.irfft(part, n=self.size[1])[..., :width], rows)
+    def seen_rows(self, rows: Tensor) -> Tensor:
+        """The pixels of the result in each row."""
+        return in_cache(lambda part: self._seen(torch.fft.irfft(part, n=self.size[1]), axis=1), rows)
+
+    def _seen(self, cycle: Tensor, *, axis: int) -> Tensor:
+        """Pixels of the result along an axis, which comes last, out of a transform."""
+        before = self.seen[axis] - self.picture[axis]
+        own = cycle[..., : self.picture[axis]]
+        return torch.cat([cycle[..., cycle.shape[-1] - before :], own], dim=-1) if before else own
+
+    def unseen(self, light: Tensor) -> Tensor:
+        """Transpose of what is seen: its pixels (..., H, W) as they lie in transforms, with zeros at ends or between."""
+        if self.border != "dark":
+            return light
+        for dim in (-2, -1):
+            before = self.window[dim] - 1
+            gap = list(light.shape)
+            gap[dim] = self.size[dim] - light.shape[dim]
+            first, own = light.split([before, light.shape[dim] - before], dim)
+            light = torch.cat([own, light.new_zeros(gap), first], dim)
+        return light
+
+    def kernel_columns(self, spectra: Tensor) -> Tensor:
+        """The rows of kernels, of a strip of columns."""
+        return torch.fft.ifft(spectra)[..., : self.window[0]].mT
+
+    def kernel_rows(self, rows: Tensor) -> Tensor:
+        """The pixels of kernels in each row."""
+        return in_cache(lambda part: torch.fft.irfft(part, n=self.size[1])[..., : self.window[1]], rows)
 
     def room(self, like: Tensor, *shape: int) -> Tensor:
         """For the half spectra of rows (*shape, F)."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 Bank = Callable[[Tensor], Tensor]
 _POINTS = 4
@@ -128,12 +127,10 @@ def _woven(own: Tensor, added: Tensor, nodes: tuple[Tensor, Tensor], *, dim: int
 
 
 def _computed(bank: Bank, rows: Tensor, columns: Tensor) -> Tensor:
-    """PSFs (Y, X, ...), none of no places. Where gradients are asked for, they are computed again on the way back."""
+    """PSFs (Y, X, ...), none of no places."""
     if not len(rows) * len(columns):
         return rows.new_empty(0)
-    places = [torch.cartesian_prod(row[None], columns).flip(1) for row in rows]
-    again = torch.is_grad_enabled()
-    return torch.stack([checkpoint(bank, own, use_reentrant=False) if again else bank(own) for own in places])
+    return torch.stack([bank(torch.cartesian_prod(row[None], columns).flip(1)) for row in rows])
 
 
 def cubic_weights(nodes: Tensor, at: Tensor, *, spacing: float = 1.0) -> Tensor:

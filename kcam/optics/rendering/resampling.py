@@ -10,24 +10,26 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from kcam.optics.autograd import cut
 from kcam.optics.rendering.borders import part, part_of
 
 Ideal = Callable[[Tensor], Tensor]
 """Where without distortion the light would fall that falls at places (..., 2) [pixels]."""
 
-Cut = Callable[..., Tensor]
+Take = Callable[..., Tensor]
 """Planes from a place to another along one axis: `borders.part`."""
 
 _STEP, _LONG = 4, 512  # pixels between computed places, on longer sides; linear between: 2e-3 pixels for 5 %
 _UNMOVED = 1e-3  # pixels: less is not moved
-_FIXED_POINT, _CROSSED = 12, 1e-6  # steps to where a row of the scene crosses a column of the picture, and pixels
+_NEWTON, _CROSSED, _FLATTEST = 8, 1e-3, 0.1  # steps to where a row of the scene meets a column, pixels, and slope
 _AT_ONCE = 2**17  # pixels of a plane: they stay in the processor's cache
 
 
@@ -42,18 +44,18 @@ class Smooth:
     before: Tensor
     share: Tensor
 
-    def strips(self, rows: list[slice]) -> Iterable[Tensor]:
-        """Its values at neighbouring strips of rows. With a graph they are parts of one: on the way back each
-        strip of its own would fill all values with zeros.
-        """
-        if self.values.requires_grad:
-            return self[rows[0].start : rows[-1].stop].split([own.stop - own.start for own in rows])
-        return (self[own] for own in rows)
+    def strips(self, rows: list[slice]) -> list[Callable[[], Tensor]]:
+        """What computes it at strips of rows, (n, W)."""
+        spans = [self.before[own][[0, -1]].tolist() for own in rows]
+        parts = cut(self.values, [(slice(first, last + 2), slice(None)) for first, last in spans])
 
-    def __getitem__(self, rows: slice) -> Tensor:
-        """Its values at rows, (n, W)."""
-        before, share = self.before[rows], self.share[rows, None]
-        return torch.lerp(self.values[before], self.values[before + 1], share)
+        def at(part: Tensor, own: slice, first: int) -> Tensor:
+            before = self.before[own] - first
+            return torch.lerp(part[before], part[before + 1], self.share[own, None])
+
+        return [
+            functools.partial(at, part, own, first) for part, own, (first, _) in zip(parts, rows, spans, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -70,15 +72,14 @@ class Resampling:
     def __call__(self, planes: Tensor) -> Tensor:
         """Means (B, K, H, W) of planes (B, K, H, W)."""
         strips = _strips(*planes.shape[-2:])
-        after = [slice(rows.start + 1, rows.stop + 1) for rows in strips]
         found = []
         for own, edges in zip(planes.split(strips[0].stop, dim=-2), self.across.strips(strips), strict=True):
-            found.append(_means(own, functools.partial(part, own), edges[:, :-1], edges[:, 1:], self.border, dim=-1))
+            found.append(_means(own, functools.partial(part, own), edges, self.border, dim=-1))
         planes = torch.cat(found, dim=-2)
         rows = planes.split(strips[0].stop if planes.requires_grad else planes.shape[-2], dim=-2)
         found = []
-        for start, stop in zip(self.down.strips(strips), self.down.strips(after), strict=True):
-            found.append(_means(planes, functools.partial(part_of, rows), start, stop, self.border, dim=-2))
+        for edges in self.down.strips([slice(own.start, own.stop + 1) for own in strips]):
+            found.append(_means(planes, functools.partial(part_of, rows), edges, self.border, dim=-2))
         return torch.cat(found, dim=-2)
 
 
@@ -91,15 +92,7 @@ def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resamplin
     if float((moved.detach() - places).abs().max()) < _UNMOVED:
         return None
     down = moved[..., 1]
-    # where the column x meets the scene's row y: y' with ideal_y(x, y') = y
-    row = y[:, None].expand(-1, len(x))
-    for _ in range(_FIXED_POINT):
-        places = torch.stack([x.expand_as(row), row], dim=-1)
-        off = y[:, None] - ideal(places)[..., 1]
-        row = row + off
-        if float(off.detach().abs().max()) < _CROSSED:
-            break
-    across = ideal(torch.stack([x.expand_as(row), row], dim=-1))[..., 0]
+    across = ideal(torch.stack([x.expand(len(y), -1), _crossing(ideal, x, y)], dim=-1))[..., 0]
     across, down = across + (width - 1) / 2, down + (height - 1) / 2
     return Resampling(
         _fine(across, x, y, columns=_edges(width), rows=_centres(height)),
@@ -108,13 +101,38 @@ def resampling(ideal: Ideal, picture: tuple[int, int], border: str) -> Resamplin
     )
 
 
+def _crossing(ideal: Ideal, x: Tensor, y: Tensor) -> Tensor:
+    """Where columns x meet rows y of the scene, (len(y), len(x)): y' with ideal_y(x, y') = y. By Newton's method, of
+    which the last step carries the derivative.
+    """
+
+    def met(row: Tensor) -> Tensor:
+        return ideal(torch.stack([x.expand_as(row), row], dim=-1))[..., 1]
+
+    rows = y[:, None].expand(-1, len(x))
+    with torch.no_grad():
+        row = rows
+        for _ in range(_NEWTON):
+            off = met(row) - rows
+            slope = (met(row + 0.5) - met(row - 0.5)).clamp(min=_FLATTEST)
+            row = row - off / slope
+            if float(off.abs().max()) < _CROSSED:
+                break
+    return row - (met(row) - rows) / slope
+
+
 def multiplied(planes: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
     """Planes (B, K, H, W) times a smooth function of places (..., 2) at their pixels, linear between a few."""
     height, width = picture = (planes.shape[-2], planes.shape[-1])
     y, x = (_coarse(n) for n in picture)
     values = function(torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1))
-    light = _fine(values, x, y, columns=_centres(width), rows=_centres(height))
-    return torch.cat([planes[..., rows, :] * light[rows].to(planes) for rows in _strips(height, width)], dim=-2)
+    light, strips = _fine(values, x, y, columns=_centres(width), rows=_centres(height)), _strips(height, width)
+
+    def product(own: Tensor, light: Callable[[], Tensor]) -> Tensor:
+        return own * light().to(own)
+
+    pairs = zip(planes.split(strips[0].stop, dim=-2), light.strips(strips), strict=True)
+    return torch.cat([_again(product, *pair) for pair in pairs], dim=-2)
 
 
 def _coarse(n: int) -> Tensor:
@@ -150,19 +168,27 @@ def _strips(height: int, width: int) -> list[slice]:
     return [slice(first, min(first + step, height)) for first in range(0, height, step)]
 
 
-def _means(planes: Tensor, cut: Cut, start: Tensor, stop: Tensor, border: str, *, dim: int) -> Tensor:
-    """Means of planes along dim -1 or -2 over stretches of it (H, W) [pixels; pixel i is i -+ 1/2]. Where gradients are
-    asked for, what that takes is computed again on the way back.
+def _again(function: Callable[..., Tensor], *arguments: Any) -> Tensor:
+    """function(*arguments). Where gradients are asked for, what that takes is computed again on the way back."""
+    return checkpoint(function, *arguments, use_reentrant=False) if torch.is_grad_enabled() else function(*arguments)
+
+
+def _means(planes: Tensor, take: Take, edges: Callable[[], Tensor], border: str, *, dim: int) -> Tensor:
+    """Means of planes along dim -1 or -2 over the stretches (H, W) between edges, one more along it [pixels; pixel i is
+    i -+ 1/2].
     """
-    start, stop, n = start.to(planes.device), stop.to(planes.device), planes.shape[dim]
+    n = planes.shape[dim]
     with torch.no_grad():
+        places = edges().to(planes.device)
+        start, stop = places.narrow(dim, 0, places.shape[dim] - 1), places.narrow(dim, 1, places.shape[dim] - 1)
         first = (start + 0.5).floor()
         reached = int(((stop + 0.5).ceil() - first).max())
         low = min(int(first.min()), n - 1)
         high = max(int(first.max()) + reached, 1, low + 1)
 
-    def means(start: Tensor, stop: Tensor) -> Tensor:
-        seen = cut(low, high, border, dim=dim)
+    def means(edges: Callable[[], Tensor]) -> Tensor:
+        seen, places = take(low, high, border, dim=dim), edges().to(planes.device)
+        start, stop = places.narrow(dim, 0, places.shape[dim] - 1), places.narrow(dim, 1, places.shape[dim] - 1)
         start, stop, index = (start - first).to(seen), (stop - first).to(seen), (first - low).long()
         width, shape = stop - start, (*seen.shape[:-2], *start.shape)
         result = seen.new_zeros(())
@@ -171,6 +197,4 @@ def _means(planes: Tensor, cut: Cut, start: Tensor, stop: Tensor, border: str, *
             result = torch.addcmul(result, seen.gather(dim, (index + step).expand(shape)), share)
         return result
 
-    if torch.is_grad_enabled() and (planes.requires_grad or start.requires_grad):
-        return checkpoint(means, start, stop, use_reentrant=False)
-    return means(start, stop)
+    return _again(means, edges)

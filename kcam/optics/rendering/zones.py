@@ -8,6 +8,7 @@ what the windows share out is all there was. Between two nodes the error is of s
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from kcam.optics.autograd import add_at, cut
 from kcam.optics.numerics import linear_weights
 from kcam.optics.rendering.borders import extend
 
@@ -46,6 +48,10 @@ class Axis:
         own = [row.nonzero()[:, 0] for row in weights]
         return cls(nodes, weights, [int(pixels[0]) for pixels in own], [int(pixels[-1]) + 1 for pixels in own])
 
+    def reach(self, index: int) -> tuple[int, int]:
+        """The first pixel in which a node has a share, and that behind the last."""
+        return self.first[index], self.last[index]
+
     def twins(self, mirrored: bool) -> list[list[int]]:
         """Nodes that are worked on together: from the middle on, each with the one that mirrors it."""
         count = len(self.nodes)
@@ -68,7 +74,7 @@ def blend(
     """The picture (B, C, H, W) of planes (B, K, H, W), with PSFs at nodes along rows and columns of a window of pixels.
 
     mirrored: nodes that mirror each other have PSFs that do. Then light is mirrored instead, and one transfer function
-    serves four zones. Where gradients are asked for, a row of zones is computed again on the way back.
+    serves four zones. Where gradients are asked for, these are computed again on the way back.
     """
     height, width = planes.shape[-2:]
     rows, columns = nodes
@@ -76,41 +82,43 @@ def blend(
     if shares is not None:  # what hides the light of a zone may stand beyond what it reaches
         wide = (4 * window[0], 4 * window[1])
         shares = extend(shares, wide, "replicate" if border == "zero" else border)
+    bands = cut(planes, [(slice(*rows.reach(row)), slice(None)) for row in range(len(rows.nodes))])
 
-    def strips(planes: Tensor, shares: Tensor | None, own: list[int]) -> list[Tensor]:
-        bands = {row: planes[..., rows.first[row] : rows.last[row], :] for row in own}
-        lights: dict[int, Tensor] = {}
-        of_columns = columns.twins(mirrored)
-        psfs = bank(torch.cartesian_prod(rows.nodes[own[:1]], columns.nodes[[twins[0] for twins in of_columns]]).flip(1))
-        for psf, twins in zip(psfs, of_columns, strict=True):
-            zones = [_Zone(rows, columns, row, column, window) for row in own for column in twins]
-            turns = [[-2] * (zone.row != own[0]) + [-1] * (zone.column != twins[0]) for zone in zones]
-            if shares is None:
-                cut = [zone.cut(bands[zone.row], turn) for zone, turn in zip(zones, turns, strict=True)]
-                found = render(psf, torch.cat(cut), None, border="dark")
-            else:
-                cut = [zone.cut_wide(bands[zone.row], turn) for zone, turn in zip(zones, turns, strict=True)]
-                hidden = [zone.cut_shares(shares).flip(turn) for zone, turn in zip(zones, turns, strict=True)]
-                found = zones[0].inside(render(psf, torch.cat(cut), torch.cat(hidden)))
-            for zone, turn, part in zip(zones, turns, found.split(len(planes)), strict=True):
-                if zone.row not in lights:
-                    lights[zone.row] = part.new_zeros(*part.shape[:-1], width + 2 * (window[1] - 1))
-                left = columns.first[zone.column]
-                lights[zone.row][..., left : left + part.shape[-1]] += part.flip(turn)
-        return [lights[row][..., window[1] - 1 : window[1] - 1 + width] for row in own]
+    def light_of(psf: Tensor, own: list[list[int]], *bands: Tensor) -> tuple[Tensor, ...]:
+        """Of nodes that mirror each other, on rows and columns `own`, of the bands of these rows."""
+        zones = [_Zone(rows, columns, row, column, window) for row in own[0] for column in own[1]]
+        turns = [[-2] * (zone.row != own[0][0]) + [-1] * (zone.column != own[1][0]) for zone in zones]
+        turned = [(zone, bands[own[0].index(zone.row)], turn) for zone, turn in zip(zones, turns, strict=True)]
+        if shares is None:
+            found = render(psf, torch.cat([zone.cut(band, turn) for zone, band, turn in turned]), None, border="dark")
+        else:
+            seen = torch.cat([zone.cut_wide(band, turn) for zone, band, turn in turned])
+            hidden = torch.cat([zone.cut_shares(shares).flip(turn) for zone, _, turn in turned])
+            found = zones[0].inside(render(psf, seen, hidden))
+        return tuple(part.flip(turn) for part, turn in zip(found.split(len(planes)), turns, strict=True))
 
     result = planes.new_zeros(())
-    for own in rows.twins(mirrored):
-        if torch.is_grad_enabled():
-            lights = checkpoint(strips, planes, shares, own, use_reentrant=False)
-        else:
-            lights = strips(planes, shares, own)
-        for row, light in zip(own, lights, strict=True):
+    again = torch.is_grad_enabled()
+    sides = columns.twins(mirrored)
+    middle = columns.nodes[[twins[0] for twins in sides]]
+    for row_twins in rows.twins(mirrored):
+        lights: dict[int, Tensor] = {}
+        psfs = bank(torch.cartesian_prod(rows.nodes[row_twins[:1]], middle).flip(1))
+        for psf, column_twins in zip(psfs, sides, strict=True):
+            arguments = (psf, [row_twins, column_twins], *(bands[row] for row in row_twins))
+            found = checkpoint(light_of, *arguments, use_reentrant=False) if again else light_of(*arguments)
+            for (row, column), part in zip(itertools.product(row_twins, column_twins), found, strict=True):
+                if row not in lights:
+                    lights[row] = part.new_zeros(*part.shape[:-1], width + 2 * (window[1] - 1))
+                left = columns.first[column]
+                lights[row] = add_at(lights[row], part, (slice(None), slice(left, left + part.shape[-1])))
+        for row, light in lights.items():
             if not result.ndim:
                 result = light.new_zeros(*light.shape[:-2], height, width)
             top = rows.first[row] - (window[0] - 1)  # of the picture
-            cut = slice(max(0, -top), min(light.shape[-2], height - top))
-            result[..., top + cut.start : top + cut.stop, :] += light[..., cut, :]
+            seen = slice(max(0, -top), min(light.shape[-2], height - top))
+            (own,) = cut(light, [(seen, slice(window[1] - 1, window[1] - 1 + width))])
+            result = add_at(result, own, (slice(top + seen.start, top + seen.stop), slice(None)))
     return result
 
 
@@ -125,10 +133,8 @@ class _Zone:
     window: tuple[int, int]
 
     def cut(self, band: Tensor, turn: list[int]) -> Tensor:
-        """The node's share of its rows of planes, that come with their border, and before it the dark that its PSF
-        reaches: around the transform it is that behind it too.
-        """
-        return torch.nn.functional.pad(self._own(band).flip(turn), [self.window[1] - 1, 0, self.window[0] - 1, 0])
+        """The node's share of its rows of planes, that come with their border."""
+        return self._own(band).flip(turn)
 
     def cut_wide(self, band: Tensor, turn: list[int]) -> Tensor:
         """The node's share, and the dark around it, where what hides the light of a zone may stand."""
