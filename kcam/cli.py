@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from kcam import __version__
+from kcam import __version__, memory
 
 if TYPE_CHECKING:
     from kcam.camera import Camera
@@ -567,4 +567,5 @@ def paint(
 
 def main() -> None:
     """Entry point of the command `kcam`."""
+    memory.keep()
     app()

@@ -17,7 +17,7 @@ IDS = [str(path.relative_to(PACKAGE)) for path in FILES]
 # Data flows down this list, and imports point up: a module imports only from rows above its own, or from its own
 # package. What stands in one row does not know of its neighbours.
 LAYERS = [
-    {"kcam.threads"},
+    {"kcam.threads", "kcam.memory"},
     {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure"}
     | {"kcam.plain", "kcam.layers", "kcam.compiled"},
     {"kcam.context", "kcam.inputs"},

@@ -197,8 +197,8 @@ class FieldPicture:
         return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
 
     def _of(self, colours: float | None) -> Bank:
-        """The bank of so many wavelengths. Where gradients are asked for, a few PSFs at a time are computed again on the
-        way back.
+        """The bank of so many wavelengths. Where gradients are asked for, it is computed again on the way back, a few
+        PSFs at a time.
         """
         own = functools.partial(self.bank, colours=colours)
 

@@ -548,9 +548,7 @@ class Imaging(Stage):
             (self.lens, corner, vergences, own), lambda: lens.over_field(corner, vergences, own)
         )
 
-    def _field_picture(
-        self, scene: Scene, *, vergences: Tensor, weights: Tensor | None, like: Tensor
-    ) -> FieldPicture:
+    def _field_picture(self, scene: Scene, *, vergences: Tensor, weights: Tensor | None, like: Tensor) -> FieldPicture:
         picture = (scene.shape[-2], scene.shape[-1])
         traced = self._traced(picture, vergences, scene.wavelengths)
         window = self.accuracy.psf_shape or _within(traced.window(self.pixels((1, 1), like)), picture)

@@ -262,9 +262,11 @@ class CompoundLens(nn.Module):
         return _Nodes(indices, t, v, aim, across, along, chief, self._towards(t, v, indices, aim, across, along))
 
     @torch.no_grad()
-    def _towards(self, t: Tensor, v: Tensor, indices: list[Tensor], aim: Tensor, across: Tensor, along: Tensor) -> Tensor:
+    def _towards(
+        self, t: Tensor, v: Tensor, indices: list[Tensor], aim: Tensor, across: Tensor, along: Tensor
+    ) -> Tensor:
         """Where rays cross the entrance pupil that come to (x, y) of the stop, in its radii, about: coefficients of x,
-        y and y^2 behind the chief ray's height, (..., 3) [m]. By rays to points `_INNER` of the radius from its middle.
+        y and y^2 beside the chief ray's height, (..., 3) [m]. By rays to points `_INNER` of the radius from its middle.
         """
         first = self.first_order()
         semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]

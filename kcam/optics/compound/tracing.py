@@ -25,7 +25,7 @@ class Rays:
     """Rays at a plane: positions x, y [m], direction cosines dx, dy towards +x, +y, and the optical path so far [m].
 
     alive: whether it has met every surface. clearance: for each clipping surface 1 - r^2 / R^2, below 0 where it does
-    not pass. margin: the least of what falls to 0 where surfaces end and where rays graze them, to be totally reflected.
+    not pass. margin: the least of what falls to 0 where surfaces end, and where rays graze them.
     """
 
     x: Tensor

@@ -153,7 +153,7 @@ class Convolution:
         return torch.cat([cycle[..., cycle.shape[-1] - before :], own], dim=-1) if before else own
 
     def unseen(self, light: Tensor) -> Tensor:
-        """Transpose of what is seen: its pixels (..., H, W) as they lie in transforms, with zeros at ends or between."""
+        """Transpose of what is seen: its pixels (..., H, W) as they lie in transforms, zeros behind or between them."""
         if self.border != "dark":
             return light
         for dim in (-2, -1):

@@ -6,6 +6,7 @@ picture may have four times as many nodes as there are PSFs, or sixteen.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -71,9 +72,8 @@ class Between:
             row = _sum([weights[own[0]] for weights in along], self.psfs, dim=-2)
             if row.requires_grad:  # on the way back each would fill a row of its own with zeros
                 turned = zip(across, (row, row.flip(-1)), strict=False)
-                yield from sum(weights[own].to(row) @ psfs.flatten(1) for weights, psfs in turned).unflatten(
-                    1, row.shape[1:]
-                )
+                sums = [weights[own].to(row) @ psfs.flatten(1) for weights, psfs in turned]
+                yield from torch.stack(sums).sum(0).unflatten(1, row.shape[1:])
             else:
                 yield from (_sum([weights[index] for weights in across], row, dim=-1) for index in own)
 
@@ -107,16 +107,14 @@ def _half(nodes: Tensor, mirrored: bool) -> Tensor:
 
 def _sum(sides: list[Tensor], psfs: Tensor, *, dim: int) -> Tensor:
     """Of PSFs (N, ...) with weights (N,), few of them other than 0; those of a second side are turned about `dim`."""
-    found = None
+    found = []
     for weights, turned in zip(sides, (False, True), strict=False):
         near = weights.nonzero()[:, 0]
         if len(near):
             few = slice(int(near[0]), int(near[-1]) + 1)
             own = (weights[few].to(psfs) @ psfs[few].flatten(1)).view(psfs.shape[1:])
-            own = own.flip(dim) if turned else own
-            found = own if found is None else found + own
-    assert found is not None  # weights are 1 together
-    return found
+            found.append(own.flip(dim) if turned else own)
+    return functools.reduce(torch.add, found)
 
 
 def _woven(own: Tensor, added: Tensor, nodes: tuple[Tensor, Tensor], *, dim: int) -> Tensor:

@@ -30,6 +30,8 @@ Take = Callable[..., Tensor]
 _STEP, _LONG = 4, 512  # pixels between computed places, on longer sides; linear between: 2e-3 pixels for 5 %
 _UNMOVED = 1e-3  # pixels: less is not moved
 _NEWTON, _CROSSED, _FLATTEST = 8, 1e-3, 0.1  # steps to where a row of the scene meets a column, pixels, and slope
+_NARROWEST = 0.75  # pixels to each side of a tent: there is one in it
+_UNSTRETCHED = 0.03  # of a pixel: less moves its light by less than 0.02 pixels
 _AT_ONCE = 2**17  # pixels of a plane: they stay in the processor's cache
 
 
@@ -174,27 +176,50 @@ def _again(function: Callable[..., Tensor], *arguments: Any) -> Tensor:
 
 
 def _means(planes: Tensor, take: Take, edges: Callable[[], Tensor], border: str, *, dim: int) -> Tensor:
-    """Means of planes along dim -1 or -2 over the stretches (H, W) between edges, one more along it [pixels; pixel i is
-    i -+ 1/2].
+    """What pixels between edges (H, W), one more along dim -1 or -2, see of planes along it [pixels; pixel i is i -+
+    1/2]: see `_shares`.
     """
     n = planes.shape[dim]
-    with torch.no_grad():
+
+    def stretches() -> tuple[Tensor, Tensor]:
+        """Middles and widths."""
         places = edges().to(planes.device)
         start, stop = places.narrow(dim, 0, places.shape[dim] - 1), places.narrow(dim, 1, places.shape[dim] - 1)
-        first = (start + 0.5).floor()
-        reached = int(((stop + 0.5).ceil() - first).max())
+        return (start + stop) / 2, stop - start
+
+    with torch.no_grad():
+        middle, width = stretches()
+        reach = width.clamp(min=1)
+        first = (middle - reach).floor() + 1
+        reached = int(((middle + reach).ceil() - first).max())
         low = min(int(first.min()), n - 1)
         high = max(int(first.max()) + reached, 1, low + 1)
 
-    def means(edges: Callable[[], Tensor]) -> Tensor:
-        seen, places = take(low, high, border, dim=dim), edges().to(planes.device)
-        start, stop = places.narrow(dim, 0, places.shape[dim] - 1), places.narrow(dim, 1, places.shape[dim] - 1)
-        start, stop, index = (start - first).to(seen), (stop - first).to(seen), (first - low).long()
-        width, shape = stop - start, (*seen.shape[:-2], *start.shape)
+    def means(stretches: Callable[[], tuple[Tensor, Tensor]]) -> Tensor:
+        seen, (middle, width) = take(low, high, border, dim=dim), stretches()
+        middle, width, index = (middle - first).to(seen), width.to(seen), (first - low).long()
+        shape = (*seen.shape[:-2], *middle.shape)
+        shares = _shares([middle - step for step in range(reached)], width)
         result = seen.new_zeros(())
-        for step in range(reached):
-            share = (stop.clamp(max=step + 0.5) - start.clamp(min=step - 0.5)).clamp(min=0) / width
+        for step, share in enumerate(shares):
             result = torch.addcmul(result, seen.gather(dim, (index + step).expand(shape)), share)
         return result
 
-    return _again(means, edges)
+    return _again(means, stretches)
+
+
+def _shares(away: list[Tensor], width: Tensor) -> list[Tensor]:
+    """What pixels so far away show in one of a width, in the middle of which they are 0 away: all they have together
+    is 1.
+
+    By the stretch of each that it sees, a pixel's light keeps the area that it covers, and lies off by half of what it
+    is stretched by. By a tent it keeps its place, and light of one pixel alone is off by the square of the stretch.
+    Where nothing is stretched these are the same; the tent counts for as much as keeps its place to 0.02 pixels.
+    """
+    stretches = [((width + 1) / 2 - off.abs()).clamp(min=0).minimum(width.clamp(max=1)) / width for off in away]
+    share = 1 - _UNSTRETCHED / (1 / width - 1).abs().clamp(min=_UNSTRETCHED)
+    if not bool((share > 0).any()):
+        return stretches
+    tents = [(1 - off.abs() / width.clamp(min=_NARROWEST)).clamp(min=0) for off in away]
+    whole = functools.reduce(torch.add, tents)
+    return [torch.lerp(stretch, tent / whole, share) for stretch, tent in zip(stretches, tents, strict=True)]

@@ -8,7 +8,6 @@ what the windows share out is all there was. Between two nodes the error is of s
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -84,17 +83,16 @@ def blend(
         shares = extend(shares, wide, "replicate" if border == "zero" else border)
     bands = cut(planes, [(slice(*rows.reach(row)), slice(None)) for row in range(len(rows.nodes))])
 
-    def light_of(psf: Tensor, own: list[list[int]], *bands: Tensor) -> tuple[Tensor, ...]:
-        """Of nodes that mirror each other, on rows and columns `own`, of the bands of these rows."""
-        zones = [_Zone(rows, columns, row, column, window) for row in own[0] for column in own[1]]
-        turns = [[-2] * (zone.row != own[0][0]) + [-1] * (zone.column != own[1][0]) for zone in zones]
-        turned = [(zone, bands[own[0].index(zone.row)], turn) for zone, turn in zip(zones, turns, strict=True)]
+    def light_of(psf: Tensor, twins: list[_Zone], bands: list[Tensor]) -> tuple[Tensor, ...]:
+        """Of zones that mirror each other, of bands of their rows."""
+        turns = [[-2] * (zone.row != twins[0].row) + [-1] * (zone.column != twins[0].column) for zone in twins]
+        turned = list(zip(twins, bands, turns, strict=True))
         if shares is None:
             found = render(psf, torch.cat([zone.cut(band, turn) for zone, band, turn in turned]), None, border="dark")
         else:
             seen = torch.cat([zone.cut_wide(band, turn) for zone, band, turn in turned])
             hidden = torch.cat([zone.cut_shares(shares).flip(turn) for zone, _, turn in turned])
-            found = zones[0].inside(render(psf, seen, hidden))
+            found = twins[0].inside(render(psf, seen, hidden))
         return tuple(part.flip(turn) for part, turn in zip(found.split(len(planes)), turns, strict=True))
 
     result = planes.new_zeros(())
@@ -105,13 +103,15 @@ def blend(
         lights: dict[int, Tensor] = {}
         psfs = bank(torch.cartesian_prod(rows.nodes[row_twins[:1]], middle).flip(1))
         for psf, column_twins in zip(psfs, sides, strict=True):
-            arguments = (psf, [row_twins, column_twins], *(bands[row] for row in row_twins))
+            twins = [_Zone(rows, columns, row, column, window) for row in row_twins for column in column_twins]
+            arguments = psf, twins, [bands[zone.row] for zone in twins]
             found = checkpoint(light_of, *arguments, use_reentrant=False) if again else light_of(*arguments)
-            for (row, column), part in zip(itertools.product(row_twins, column_twins), found, strict=True):
-                if row not in lights:
-                    lights[row] = part.new_zeros(*part.shape[:-1], width + 2 * (window[1] - 1))
-                left = columns.first[column]
-                lights[row] = add_at(lights[row], part, (slice(None), slice(left, left + part.shape[-1])))
+            for zone, part in zip(twins, found, strict=True):
+                light = lights.get(zone.row)
+                if light is None:
+                    light = part.new_zeros(*part.shape[:-1], width + 2 * (window[1] - 1))
+                left = columns.first[zone.column]
+                lights[zone.row] = add_at(light, part, (slice(None), slice(left, left + part.shape[-1])))
         for row, light in lights.items():
             if not result.ndim:
                 result = light.new_zeros(*light.shape[:-2], height, width)
