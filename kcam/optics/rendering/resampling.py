@@ -3,7 +3,7 @@
 A pixel of the picture shows the mean of the scene over the part that it sees: an even scene stays even, nothing
 aliases, and no light is moved by more than it was moved by the lens. Two passes, along rows and then along columns
 (Catmull and Smith, SIGGRAPH 1980): each is a mean over stretches of pixels, exact for scene pixels that are squares of
-even light. A pixel's light is even over it: where pixels are stretched by 10 %, a point may lie 0.05 pixels off.
+even light. By areas alone a point would lie off by half of what its pixel is stretched by: see `_shares`.
 """
 
 from __future__ import annotations
