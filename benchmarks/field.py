@@ -197,7 +197,7 @@ class Baseline:
         on_sensor = -places.to(torch.float64) * own.pitch
         pixels = own.imaging.pixels(own.window, own.scene.coefficients)
         light = self.over_field.illumination(on_sensor)
-        psfs = self.over_field.bank(on_sensor, pixels, whole=True, mixing=self.mixing.flatten(0, 1))[:, 0]
+        psfs = self.over_field.bank(on_sensor, pixels, whole=True)[:, 0]
         return psfs / light.to(psfs)[:, None, None, None]
 
     @property

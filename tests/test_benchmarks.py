@@ -352,9 +352,10 @@ def test_pictures_over_the_field_beside_patches_and_eigen_psfs(tmp_path: Path) -
     before = json.loads(path.read_text())["rows"]
     photograph = {row["who"]: row for row in before if row["part"] == "methods" and row["scene"] == "photograph"}
     assert set(over_field.BASELINES) < set(photograph)
-    # all the same distortion and light: near the axis of a 50 mm at f/4 one PSF is 66 dB, kcam 90
-    assert photograph["kcam"]["psnr_worst"] > 80
-    assert all(45 < photograph[who]["psnr"] < photograph["kcam"]["psnr"] + 3 for who in over_field.BASELINES)
+    # kcam spends its error up to 60 dB; so near the axis of a 50 mm at f/4 PSFs hardly vary, but the picture is bent
+    assert photograph["kcam"]["psnr_worst"] > 60
+    plain = photograph.pop("one PSF, nothing moved or darkened")
+    assert all(row["psnr"] > plain["psnr"] + 3 for row in photograph.values() if "psnr" in row)
     assert all(row["finite"] and row["curvatures"] > 8 for row in before if row["part"] == "gradient")
     assert over_field.main([*arguments, "--only", "pictures"]) == 0
     after = json.loads(path.read_text())["rows"]

@@ -13,7 +13,6 @@ from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.optics.source import PixelGrid
 
 _COLOURS = (5, 7, 10, 14, 20)  # wavelengths at which PSFs are computed
-COLOUR_ERROR = 1e-2
 OUTSIDE = 5e-3
 """Share of the light that the default window may leave out; it is put back into the window, see `Imaging`."""
 KEPT = 2e8  # bytes of PSFs that are kept
@@ -37,8 +36,7 @@ class Banks:
     mirrored: bool = True
     few: bool = True
 
-    kept: dict[tuple[object, ...], tuple[Tensor, Tensor, float]] = field(default_factory=dict, repr=False)
-    kept_banks: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
+    kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
 
     def bank(
         self,
@@ -47,24 +45,22 @@ class Banks:
         *,
         whole: bool = False,
         mixing: Tensor | None = None,
-        mixed: bool = False,
-        colours: float | None = None,
+        colours: float = math.inf,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of places (F, 2) [m]; of many wavelengths the PSFs' pixels are polynomials through those
-        of a few. Without gradients they are kept, up to `KEPT` bytes. whole, mixing, mixed, colours: see
-        `source.FieldPSFs`.
+        of a few. Without gradients they are kept, up to `KEPT` bytes. whole, mixing, colours: see `source.FieldPSFs`.
         """
-        key = (pixels, whole, mixed, colours, _bytes(mixing), _bytes(places))
-        if key in self.kept_banks:
-            return self.kept_banks[key]
-        nodes, shares = self.colours(pixels, mixing)[:2] if colours is None else self._few(colours)
-        if mixed and mixing is not None:
+        key = (pixels, whole, colours, _bytes(mixing), _bytes(places))
+        if key in self.kept:
+            return self.kept[key]
+        nodes, shares = self._few(colours)
+        if mixing is not None:
             shares = mixing.to(shares) @ shares
-        each = len(nodes) == len(self.wavelengths) and not mixed  # stands for itself
+        each = len(nodes) == len(self.wavelengths) and mixing is None  # stands for itself
         found = self._distinct(places, pixels, nodes, None if each else shares, whole=whole).to(pixels.device)
-        held = sum(bank.nbytes for bank in self.kept_banks.values())
+        held = sum(bank.nbytes for bank in self.kept.values())
         if not found.requires_grad and held + found.nbytes <= KEPT:
-            self.kept_banks[key] = found
+            self.kept[key] = found
         return found
 
     @property
@@ -99,34 +95,6 @@ class Banks:
                 ]
             )
         return psfs[..., :height, :width]
-
-    def colours(self, pixels: PixelGrid, mixing: Tensor | None = None) -> tuple[Tensor, Tensor, float]:
-        """Wavelengths (n,) at which PSFs are computed, and what each gives to those that are asked for, (L, n): as few
-        as leave `COLOUR_ERROR` of the light in what the picture adds up of them; and what these leave.
-        """
-        key = (pixels, _bytes(mixing))
-        if key not in self.kept:
-            self.kept[key] = self._fewest(pixels, mixing)
-        return self.kept[key]
-
-    @torch.no_grad()
-    def _fewest(self, pixels: PixelGrid, mixing: Tensor | None) -> tuple[Tensor, Tensor, float]:
-        every = self._few(math.inf)
-        if not self.fewer:
-            return *every, 0.0
-        places = torch.tensor([[0.0, 0.0], [0.42, 0.56]], dtype=torch.float64) * self.reach
-        mixing = every[1] if mixing is None else mixing.double().cpu()
-        mixing = mixing / mixing.abs().sum(1, keepdim=True).clamp(min=1e-300)
-        truth = self.compute(places, self.wavelengths, pixels, False)
-        truth = torch.einsum("ml,fzlhw->fzmhw", mixing.to(pixels.dtype), truth)
-        for n in self.fewer:
-            nodes, shares = self._few(n)
-            found = self.compute(places, nodes, pixels, False)
-            found = torch.einsum("mn,fznhw->fzmhw", (mixing @ shares).to(truth), found)
-            off = float((found - truth).abs().sum((-2, -1)).max())
-            if off < COLOUR_ERROR:
-                return nodes, shares, off
-        return *every, 0.0
 
 
 def window_side(slopes: Tensor, tail: Tensor, *, pitch: float) -> int:

@@ -89,7 +89,7 @@ class _How:
     blending: float = 0.0
     known: Between | None = None
     between: float = 0.0
-    colours: float | None = None
+    colours: float = math.inf
     coloured: float = 0.0
 
 
@@ -109,9 +109,10 @@ class FieldPicture:
     """How a picture over the field is made.
 
     psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. render: of one
-    zone. border: see `Imaging`. spacing: pixels between nodes, inf for one PSF, or None. whole: the light outside the
-    window is put back into it. mixing: weights (M, L) of what the picture adds up; mixed: render takes these sums.
-    most: bytes of PSFs that are held.
+    zone. border: see `Imaging`. spacing: pixels between nodes, inf for one PSF, or None. varies, distorts, darkens:
+    whether PSFs do, distortion and relative illumination. whole: the light outside the window is put back into it.
+    mixing: weights (M, L) of what the picture adds up; mixed: render takes these sums. most: bytes of PSFs that are
+    held.
     """
 
     psfs: FieldPSFs
@@ -120,6 +121,9 @@ class FieldPicture:
     render: Render
     border: str
     spacing: float | None = None
+    varies: bool = True
+    distorts: bool = True
+    darkens: bool = True
     whole: bool = True
     mixing: Tensor | None = None
     mixed: bool = False
@@ -147,9 +151,11 @@ class FieldPicture:
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Where distortion brings them, planes times the relative illumination there: nodes share out what is left."""
         picture = (planes.shape[-2], planes.shape[-1])
-        moves = self.distortion(picture)
+        moves = self.distortion(picture) if self.distorts else None
         if moves is not None:
             planes, shares = moves(planes), None if shares is None else moves(shares)
+        if not self.darkens:
+            return planes, shares
         return multiplied(planes, lambda places: self.psfs.illumination(self._on_sensor(places))), shares
 
     def distortion(self, picture: tuple[int, int]) -> Resampling | None:
@@ -161,13 +167,13 @@ class FieldPicture:
 
         return resampling(ideal, picture, self.border)
 
-    def bank(self, places: Tensor, *, colours: float | None = None) -> Tensor:
+    def bank(self, places: Tensor, *, colours: float = math.inf) -> Tensor:
         """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
-        on_sensor = self._on_sensor(places)
-        psfs = self.psfs.bank(
-            on_sensor, self.pixels, whole=self.whole, mixing=self.mixing, mixed=self.mixed, colours=colours
-        )
-        return psfs / self.psfs.illumination(on_sensor).to(psfs).view(-1, 1, 1, 1, 1)
+        own = self._on_sensor(places) if self.varies else torch.zeros_like(places[:1])
+        mixing = self.mixing if self.mixed else None
+        psfs = self.psfs.bank(own, self.pixels, whole=self.whole, mixing=mixing, colours=colours)
+        psfs = psfs / self.psfs.illumination(own).to(psfs).view(-1, 1, 1, 1, 1)
+        return psfs.expand(len(places), *psfs.shape[1:])
 
     def explain(self, planes: Tensor, shares: Tensor | None) -> FieldEstimate:
         """What `light` will do, and what it is off by."""
@@ -183,11 +189,10 @@ class FieldPicture:
             if self.spacing is not None and math.isinf(self.spacing):  # one PSF on purpose
                 apart = max(picture)
             elif self.spacing is not None:
-                blending = self._left(self._detail(planes, shares, self.bank), self._blended(self.bank, picture, apart))
-            deviations = self.psfs.deviations(self.pixels, mixing=self.mixing, colours=how.colours)
-            if how.colours is not None:
-                deviations["colours"] = how.coloured
-            return FieldEstimate((rows, columns), int(apart), blending, how.between, **deviations)
+                bank = self._of(how.colours)
+                blending = self._left(self._detail(planes, shares, bank), self._blended(bank, picture, apart))
+            deviations = self.psfs.deviations(self.pixels, colours=how.colours)
+            return FieldEstimate((rows, columns), int(apart), blending, how.between, colours=how.coloured, **deviations)
 
     @property
     def _centre(self) -> Tensor:
@@ -196,7 +201,7 @@ class FieldPicture:
     def _on_sensor(self, places: Tensor) -> Tensor:
         return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
 
-    def _of(self, colours: float | None) -> Bank:
+    def _of(self, colours: float) -> Bank:
         """The bank of so many wavelengths. Where gradients are asked for, it is computed again on the way back, a few
         PSFs at a time.
         """
@@ -212,25 +217,27 @@ class FieldPicture:
 
     def how(self, planes: Tensor, shares: Tensor | None) -> _How:
         """How densely PSFs are computed, and nodes lie, for `ALLOWED`: planes as they were moved."""
-        if self.spacing is not None:
-            return _How(self.spacing)
         sides = (planes.shape[-2], planes.shape[-1])
         probe = _probe(sides)
         fewest = self.psfs.fewer_colours[:1] or (math.inf,)
         detail = self._detail(planes, shares, self._of(fewest[0]))
         colours, coloured = self._colours(detail, sides)
+        how = _How(probe if self.spacing is None else self.spacing, colours=colours, coloured=coloured)
+        if self.spacing is not None:
+            return how
         bank, rest = self._of(colours), ALLOWED**2 - coloured**2
-        how = _How(probe, colours=colours, coloured=coloured)
-        places, known = 2.0 * probe, Between.known(bank, sides, apart=2.0 * probe, mirrored=self._mirrored)
+        places, most = 2.0 * probe, BETWEEN * ALLOWED
         while True:
+            known = Between.known(bank, sides, apart=places, mirrored=self._mirrored)
             off = self._left(detail, self._interpolated(bank, known, sides))
             error = SHARED * self._left(detail, self._blended(known, sides, probe))
-            apart, error = _apart(error, probe, allowed=math.sqrt(rest - min(off, BETWEEN * ALLOWED) ** 2))
-            if off <= BETWEEN * ALLOWED:
+            apart, error = _apart(error, probe, allowed=math.sqrt(rest - min(off, most) ** 2))
+            if off <= most:
                 return replace(how, apart=apart, blending=error, known=known, between=off)
-            if places / 2 < apart or 4 * known.psfs.nbytes > self.most:
+            closer = 0.9 * (most / off) ** 0.25  # of fourth order, with something to spare
+            if closer * places < apart or known.psfs.nbytes / closer**2 > self.most:
                 break
-            places, known = places / 2, known.refined(bank)
+            places *= closer
         error = self._left(detail, self._blended(bank, sides, probe))
         apart, better = _apart(SHARED * error, probe, allowed=math.sqrt(rest))
         if known.psfs.nbytes * (places / apart) ** 2 < self.most:

@@ -30,7 +30,6 @@ from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, 
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.optics.rendering.zones import Axis
-from kcam.optics.simpler import SimplerField
 from kcam.optics.source import Defocus, FieldPSFs, FieldSource, PixelGrid, Points, PSFSource
 from kcam.precision import full_precision
 from kcam.scene import Scene
@@ -584,11 +583,21 @@ class Imaging(Stage):
 
         pixels, own = self.pixels(window, like), self.accuracy
         spacing = own.spacing if own.field_variation else math.inf
-        if not (own.field_variation and own.distortion and own.relative_illumination):
-            psfs = SimplerField(psfs, own.field_variation, own.distortion, own.relative_illumination)
-        whole = self.accuracy.renormalise or self.accuracy.psf_shape is None
-        most = self.accuracy.max_memory / 2
-        return FieldPicture(psfs, pixels, self._middle, render, self.border, spacing, whole, mixing, mixed, most)
+        return FieldPicture(
+            psfs,
+            pixels,
+            self._middle,
+            render,
+            self.border,
+            spacing,
+            varies=own.field_variation,
+            distorts=own.distortion,
+            darkens=own.relative_illumination,
+            whole=own.renormalise or own.psf_shape is None,
+            mixing=mixing,
+            mixed=mixed,
+            most=own.max_memory / 2,
+        )
 
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
         """What a picture over the field will be off by; as it is with `forward`'s arguments. Raises: ValueError for

@@ -133,16 +133,13 @@ class FieldPSFs(Protocol):
         *,
         whole: bool = False,
         mixing: Tensor | None = None,
-        mixed: bool = False,
-        colours: float | None = None,
+        colours: float = math.inf,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what the chief ray of the focus brings to places (F, 2) [m], as light falls; relative
         to the light of a point on the axis. The window's middle is that place.
 
-        whole: light outside is put back. mixing: weights (M, L) of what the picture adds up, from which follows how
-        closely wavelengths are to be told apart; None: each is seen. mixed: these sums instead, (F, Z, M, h, w).
-        colours: at how many wavelengths PSFs are computed, between which they are polynomials; None: as many as leave
-        1 % of the light of what is mixed.
+        whole: light outside is put back. mixing: weights (M, L) of sums that stand instead, (F, Z, M, h, w). colours:
+        at how many wavelengths PSFs are computed, at most, between which they are polynomials.
         """
 
     @property
@@ -168,11 +165,9 @@ class FieldPSFs(Protocol):
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
         """Of others (L,) [m] in the same range; without `lateral_colour` all fall where the middle one does."""
 
-    def deviations(
-        self, pixels: PixelGrid, *, mixing: Tensor | None = None, colours: float | None = None
-    ) -> dict[str, float]:
-        """What PSFs may be off by, of their light: pupils, colours, sampling, outside; see `field.FieldEstimate`. With
-        `colours` given, who asks knows what these leave.
+    def deviations(self, pixels: PixelGrid, *, colours: float = math.inf) -> dict[str, float]:
+        """What PSFs of so many colours may be off by, of their light: pupils, sampling, outside; see
+        `field.FieldEstimate`.
         """
 
 

@@ -74,13 +74,12 @@ class FieldPSFs:
         *,
         whole: bool = False,
         mixing: Tensor | None = None,
-        mixed: bool = False,
-        colours: float | None = None,
+        colours: float = math.inf,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what falls at places (F, 2) [m] by the chief ray of the focus, relative to the light
         of a point on the axis: see `banks.Banks`.
         """
-        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, mixed=mixed, colours=colours)
+        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, colours=colours)
 
     @property
     def fewer_colours(self) -> tuple[int, ...]:
@@ -110,12 +109,10 @@ class FieldPSFs:
         return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
 
     @torch.no_grad()
-    def deviations(
-        self, pixels: PixelGrid, *, mixing: Tensor | None = None, colours: float | None = None
-    ) -> dict[str, float]:
+    def deviations(self, pixels: PixelGrid, *, colours: float = math.inf) -> dict[str, float]:
         """What PSFs may be off by, of their light: see `field.FieldEstimate`."""
         places = torch.tensor([[0.0, 0.0], [0.54, 0.72]], dtype=torch.float64) * self.reach
-        psfs = self.bank(places, pixels, mixing=mixing, colours=colours)
+        psfs = self.bank(places, pixels, colours=colours)
         radii = places.norm(dim=1)
         fitted = self._fitted(radii, self.wavelengths)
         frame = Frame.upright(fitted)
@@ -126,7 +123,6 @@ class FieldPSFs:
         )
         return {
             "pupils": pupils,
-            "colours": self._banks.colours(pixels, mixing)[2] if colours is None else 0.0,
             "sampling": QUICK_ERROR,
             "outside": float(lost.max().clamp(min=0)),
         }

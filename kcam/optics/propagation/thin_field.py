@@ -37,11 +37,10 @@ class ThinFieldPSFs:
         *,
         whole: bool = False,
         mixing: Tensor | None = None,
-        mixed: bool = False,
-        colours: float | None = None,
+        colours: float = math.inf,
     ) -> Tensor:
         """PSFs (F, Z, L, h, w) of what the chief ray brings to places (F, 2) [m]: see `banks.Banks`."""
-        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, mixed=mixed, colours=colours)
+        return self._banks.bank(places, pixels, whole=whole, mixing=mixing, colours=colours)
 
     @property
     def fewer_colours(self) -> tuple[int, ...]:
@@ -112,15 +111,13 @@ class ThinFieldPSFs:
         return side, side
 
     @torch.no_grad()
-    def deviations(
-        self, pixels: PixelGrid, *, mixing: Tensor | None = None, colours: float | None = None
-    ) -> dict[str, float]:
+    def deviations(self, pixels: PixelGrid, *, colours: float = math.inf) -> dict[str, float]:
         """What PSFs may be off by, of their light: see `field.FieldEstimate`. pupils: by the kernel, which is good to
         the first order in either of the place in the pupil and that in the window: pi a^2 r^2 / (lambda R0^3).
         """
         query = self.query
         places = torch.tensor([[0.0, 0.0], [0.54, 0.72]], dtype=torch.float64, device=query.device) * self.reach
-        psfs = self.bank(places, pixels, mixing=mixing, colours=colours).double()
+        psfs = self.bank(places, pixels, colours=colours).double()
         lost = 1 - psfs.sum((-2, -1)) / relative_illumination(self._seen(places))[:, None, None]
         y, x = (
             (torch.arange(n, dtype=torch.float64, device=psfs.device) - n // 2) * pixels.pitch for n in pixels.shape
@@ -130,7 +127,6 @@ class ThinFieldPSFs:
         phase = math.pi * query.semi_aperture**2 * r2 / (query.wavelengths.to(r2) * far**3)
         return {
             "pupils": min(1.0, _MODEL * float(phase.max())),
-            "colours": self._banks.colours(pixels, mixing)[2] if colours is None else 0.0,
             "sampling": ERROR,
             "outside": float(lost.max().clamp(min=0)),
         }

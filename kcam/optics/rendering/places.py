@@ -37,17 +37,8 @@ class Between:
     def known(cls, bank: Bank, picture: tuple[int, int], *, apart: float, mirrored: bool = False) -> Between:
         """PSFs at most so many pixels apart."""
         rows, columns = (grid(n, apart=apart) for n in picture)
-        return cls(rows, columns, _computed(bank, *(_half(nodes, mirrored) for nodes in (rows, columns))), mirrored)
-
-    def refined(self, bank: Bank) -> Between:
-        """With those in the middle between them too."""
-        y, x = (_half(nodes, self.mirrored) for nodes in (self.rows, self.columns))
-        between_y, between_x = (_half(middles(nodes), self.mirrored) for nodes in (self.rows, self.columns))
-        psfs = _woven(self.psfs, _computed(bank, y, between_x), (x, between_x), dim=1)
-        both = torch.cat([x, between_x]).sort().values
-        psfs = _woven(psfs, _computed(bank, between_y, both), (y, between_y), dim=0)
-        rows, columns = (torch.cat([nodes, middles(nodes)]).sort().values for nodes in (self.rows, self.columns))
-        return replace(self, rows=rows, columns=columns, psfs=psfs)
+        y, x = (nodes[len(nodes) // 2 :] if mirrored else nodes for nodes in (rows, columns))
+        return cls(rows, columns, torch.stack([bank(torch.cartesian_prod(at[None], x).flip(1)) for at in y]), mirrored)
 
     def shared(self, rows: Tensor, columns: Tensor) -> Between:
         """For nodes at rows and columns that share out what lies between them."""
@@ -56,7 +47,7 @@ class Between:
 
     def middle(self, place: Tensor) -> Tensor:
         """Of the cell around a place (1, 2)."""
-        nodes = [middles(own) if len(own) > 1 else own for own in (self.columns, self.rows)]
+        nodes = [(own[1:] + own[:-1]) / 2 if len(own) > 1 else own for own in (self.columns, self.rows)]
         return torch.stack([own[(own - at).abs().argmin()] for own, at in zip(nodes, place[0], strict=True)])[None]
 
     def __call__(self, places: Tensor) -> Tensor:
@@ -95,16 +86,6 @@ def grid(n: int, *, apart: float) -> Tensor:
     return torch.linspace(-(n - 1) / 2, (n - 1) / 2, count, dtype=torch.float64)
 
 
-def middles(nodes: Tensor) -> Tensor:
-    """Between neighbours."""
-    return (nodes[1:] + nodes[:-1]) / 2
-
-
-def _half(nodes: Tensor, mirrored: bool) -> Tensor:
-    """Those from the middle on, where they stand for all."""
-    return nodes[len(nodes) // 2 :] if mirrored else nodes
-
-
 def _sum(sides: list[Tensor], psfs: Tensor, *, dim: int) -> Tensor:
     """Of PSFs (N, ...) with weights (N,), few of them other than 0; those of a second side are turned about `dim`."""
     found = []
@@ -115,20 +96,6 @@ def _sum(sides: list[Tensor], psfs: Tensor, *, dim: int) -> Tensor:
             own = (weights[few].to(psfs) @ psfs[few].flatten(1)).view(psfs.shape[1:])
             found.append(own.flip(dim) if turned else own)
     return functools.reduce(torch.add, found)
-
-
-def _woven(own: Tensor, added: Tensor, nodes: tuple[Tensor, Tensor], *, dim: int) -> Tensor:
-    """Tensors at nodes along a dimension, and others at further ones, in their order."""
-    if not len(nodes[1]):
-        return own
-    return torch.cat([own, added], dim).index_select(dim, torch.cat(nodes).argsort().to(own.device))
-
-
-def _computed(bank: Bank, rows: Tensor, columns: Tensor) -> Tensor:
-    """PSFs (Y, X, ...), none of no places."""
-    if not len(rows) * len(columns):
-        return rows.new_empty(0)
-    return torch.stack([bank(torch.cartesian_prod(row[None], columns).flip(1)) for row in rows])
 
 
 def cubic_weights(nodes: Tensor, at: Tensor, *, spacing: float = 1.0) -> Tensor:
