@@ -50,7 +50,6 @@ PATCHES, PLACES, EIGEN = 7, 5, 5
 FINE = 16  # pixels between PSFs of the truth
 CROPS = ((0.5, 0.5), (0.3, 0.68), (0.12, 0.45), (0.0, 0.0))  # shares of height and width: the last is a corner
 DENSEST = 40  # pixels across, that each get a PSF: what reaches the crop
-SQUARE = 1024  # what baselines convolve at once [pixels]
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,6 @@ class Baseline:
             spectra=scene.spectra.to(planes),
             weights=self.setup.colour_filter.contraction(scene.wavelengths).detach().to(planes),
             picture=self.setup.shape,
-            tile=SQUARE if min(self.setup.shape) > SQUARE else None,
         )
         return renderer.blur(planes, layer=0)
 

@@ -14,10 +14,6 @@ from kcam import files, optics, plots
 from kcam.camera import Camera
 from kcam.scene import Scene
 
-LARGE = 2**21
-"""Pixels above which the convolution is cut into tiles."""
-TILE = 1024
-
 
 def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     """Which file each photo becomes: `out` itself for one, else a .png of the same name in the folder `out`.
@@ -83,14 +79,9 @@ def shoot(
         raise ValueError(f"{photo.name} has {longest} pixels on its longer side, and --size asks for {size}.")
     if size is not None:
         scene = scene.resized(size)
-    _, height, width = scene.shape
-    stages = list(camera)
-    for index, stage in enumerate(stages):
+    for stage in camera:
         if isinstance(stage, optics.Imaging):
-            check_not_too_near(stage, distance, shape=(height, width))
-            if height * width > LARGE and stage.accuracy.tile is None:
-                stages[index] = stage.changed(tile=TILE)
-    camera = Camera(*stages, context=camera.context)
+            check_not_too_near(stage, distance, shape=(scene.shape[1], scene.shape[2]))
     with torch.no_grad():
         if tolerance is not None:
             camera = camera.plan(scene, tolerance=tolerance).apply(camera)

@@ -14,9 +14,10 @@ from commands import fails, run
 from PIL import Image
 from stages import painting_stage
 
-from kcam import Camera, optics, plots, sensor
+from kcam import Camera, plots, sensor
 from kcam import shoot as module
 from kcam.isp import style_stage
+from kcam.optics.rendering import ways
 from kcam.style import style_camera
 
 WIDTH, HEIGHT = 56, 40
@@ -273,18 +274,15 @@ def test_a_large_photo_goes_through_tiles(name: str, tmp_path: Path, monkeypatch
     photo = make_photo(tmp_path / "photo.png", width=203, height=150)
     whole, tiled = tmp_path / "whole.png", tmp_path / "tiled.png"
     module.shoot(camera, photo, whole, distance=2.0)
-    monkeypatch.setattr(module, "LARGE", 150 * 203 - 1)
-    monkeypatch.setattr(module, "TILE", 64)
-    cut = []
-    own = optics.Imaging.changed
-    monkeypatch.setattr(optics.Imaging, "changed", lambda self, **how: cut.append(how) or own(self, **how))
+    monkeypatch.setattr(ways, "_WHOLE", 150 * 203 - 1)
+    monkeypatch.setattr(ways, "_SIDE", 64)
+    squares = []
+    own = ways.Bank.in_squares
+    monkeypatch.setattr(ways.Bank, "in_squares", lambda bank, *given: squares.append(bank.squares) or own(bank, *given))
     module.shoot(camera, photo, tiled, distance=2.0)
-    assert cut == [{"tile": 64}]
+    assert set(squares) == {(3, 4)}
     assert np.abs(pixels(whole) - pixels(tiled)).max() <= 1
     assert camera[0].tile is None  # the user's own camera stays as it was
-    monkeypatch.setattr(module, "LARGE", 150 * 203)
-    module.shoot(camera, photo, whole, distance=2.0)
-    assert len(cut) == 1
 
 
 def test_strokes_of_a_large_photo(tmp_path: Path, styled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,7 +290,7 @@ def test_strokes_of_a_large_photo(tmp_path: Path, styled: Path, monkeypatch: pyt
     photo = make_photo(tmp_path / "photo.png", width=203, height=150)
     whole, tiled, again = (tmp_path / f"{name}.png" for name in ("whole", "tiled", "again"))
     run("shoot", photo, "--camera", styled, "--out", whole)
-    for place, name, value in ((module, "LARGE", 0), (module, "TILE", 64)):
+    for place, name, value in ((ways, "_WHOLE", 0), (ways, "_SIDE", 64)):
         monkeypatch.setattr(place, name, value)
     for place, name, value in ((style_stage, "SEEN_AT_ONCE", 0), (style_stage, "TILE", 96)):
         monkeypatch.setattr(place, name, value)

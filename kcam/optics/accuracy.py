@@ -67,7 +67,8 @@ class Accuracy(Recipe):
             spans more than float32's transforms hold, see `rendering.rounding.wide_range`.
     With the same result, for less memory or time:
         max_memory: bytes that the transforms may take; bands are split to stay below.
-        tile: side of the squares that are convolved one by one [pixels], or None.
+        tile: side of the squares that are convolved one by one [pixels]; None: only a picture of more than 5
+            megapixels is cut.
         direct: convolve in the picture, without a Fourier transform: faster for small windows.
     Raises: ValueError for an unknown propagator, coverage or precision, a shape, count or memory that is not positive,
         a distance not in metres, a kappa of 1 or less; TypeError for layers that are neither a number nor distances.

@@ -7,7 +7,6 @@ import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -33,7 +32,6 @@ NOISE_SHARE = 0.1
 Signals = Sequence[Mapping[int, tuple[torch.Tensor, Context]]]
 """For each sample, what the stages of the sensor are given."""
 
-TILES = (256, 512, 1024)
 GAIN = 0.98  # of the time, that a choice must leave to be considered
 
 
@@ -327,14 +325,6 @@ class _Prices:
         return self.of(ladder.levels[0].changes)[0] <= GAIN * self.of({})[0] or len(ladder.levels) == 1
 
 
-@dataclass(frozen=True)
-class _Way:
-    """How to convolve: with one result."""
-
-    label: str
-    changes: dict[str, Any]
-
-
 class _Rows:
     """The decisions, one after the other, and what is spent after each."""
 
@@ -359,17 +349,14 @@ class _Rows:
         """The convolution, by predicted time alone: all ways have one result."""
         if self.price.imaging is None:
             return
-        whole = _Way("by FFT, whole", {})
-        ways = [whole, _Way("direct", {"direct": True})]
-        side = max(self.price.scene.shape[1:])
-        ways += [_Way(f"by FFT, {tile} px tiles", {"tile": tile}) for tile in TILES if tile < side]
-        best = min(ways, key=lambda way: self.price.of(self.changes | way.changes)[0])
-        before = self.price.of(self.changes)[0]
-        after = self.price.of(self.changes | best.changes)[0]
-        self.changes |= best.changes
-        self.spent = self.price.of(self.changes)
-        why = "" if best is whole else f"{before / max(after, 1e-12):.2g} times as fast"
-        self._add("convolution", best.label, "" if best is whole else whole.label, why)
+        before = self.spent[0]
+        after = self.price.of(self.changes | {"direct": True})[0]
+        if after < before:
+            self.changes |= {"direct": True}
+            self.spent = self.price.of(self.changes)
+            self._add("convolution", "direct", "by FFT", f"{before / max(after, 1e-12):.2g} times as fast")
+        else:
+            self._add("convolution", "by FFT", "", "")
 
     def add_skip(self, skip: _Skip, *, left_out: bool) -> None:
         """A stage of the sensor, or of the user's."""

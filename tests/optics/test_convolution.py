@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random as draws
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from kcam import optics
 from kcam.context import Context
+from kcam.optics.rendering import ways
 from kcam.optics.rendering.borders import BORDERS, part, part_of
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.ways import WAYS as TABLE
@@ -58,6 +60,30 @@ def test_every_way_gives_the_same_result_and_gradients(content: str, way: str, b
         light, cover = renderer.blur(planes, layer=0), renderer.coverage(mask, layer=0)
         loss = (light * random(*light.shape, seed=5)).sum()
         results.append((light, cover, *torch.autograd.grad(loss, (planes, psfs))))
+    for found, expected in zip(results[1], results[0], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_large_picture_is_cut_into_even_squares(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one result, and the gradients of the whole; no square is larger than it must be."""
+    draw = draws.Random(seed)
+    border = draw.choice(BORDERS)
+    picture, window = ((draw.randint(9, 40), draw.randint(9, 40)), (draw.randint(1, 12), draw.randint(1, 12)))
+    factors, channels = CONTENTS[draw.choice(list(CONTENTS))]
+    spectra = None if factors is None else random(factors, 5, seed=3)
+    weights = None if channels is None else random(channels, 5, seed=4)
+    results = []
+    for whole in (10**9, math.prod(picture) - 1):
+        monkeypatch.setattr(ways, "_WHOLE", whole)
+        monkeypatch.setattr(ways, "_SIDE", 8)
+        planes = random(2, factors or 5, *picture, seed=1).requires_grad_()
+        psfs = random(1, 5, *window, seed=2).requires_grad_()
+        renderer = Renderer(psfs, spectra=spectra, weights=weights, picture=picture, border=border)
+        light = renderer.blur(planes, layer=0)
+        results.append((light, *torch.autograd.grad((light * random(*light.shape, seed=5)).sum(), (planes, psfs))))
+    assert renderer.squares == (-(-picture[0] // 8), -(-picture[1] // 8))
+    assert all(n * count - n < side for n, count, side in zip(renderer.square, renderer.squares, picture, strict=True))
     for found, expected in zip(results[1], results[0], strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-11, atol=1e-11)
 

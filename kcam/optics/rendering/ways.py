@@ -26,6 +26,9 @@ from kcam.optics.rendering.convolution import Convolution, correlate
 
 Blur = Callable[[Tensor], Tensor]  # planes (B, K, H, W) to channels (B, C, H, W), of one square
 
+_WHOLE = 5 * 2**20  # pixels of a picture that are transformed at once, with a window of any size: measured on a CPU
+_SIDE = 1024  # of the squares of a larger one, at most
+
 
 @dataclass(eq=False)
 class Bank:
@@ -39,7 +42,7 @@ class Bank:
     owner: Tensor | None = None  # (L,) which of the G PSFs each band takes; None where each has its own
     border: str = "reflect"  # what lies beyond the picture, one of `BORDERS`
     direct: bool = False  # sum over the window instead of by FFT; with the same result, faster for small windows
-    tile: int | None = None  # side of squares that the picture is cut into [pixels]; with the same result, less memory
+    tile: int | None = None  # side of squares that the picture is cut into [pixels]; None: those of a large one
     max_memory: float = 2e9  # bytes that the transforms may take
     cache: ValueCache | None = None  # for transfer functions, while the optics stay
 
@@ -49,9 +52,11 @@ class Bank:
         self.bands = self.groups if self.owner is None else len(self.owner)
         self.planes = self.bands if self.spectra is None else len(self.spectra)
         self.channels = self.bands if self.weights is None else len(self.weights)
-        self.square = self.picture  # what is convolved at once
-        if self.tile is not None and self.border != "dark":
-            self.square = (min(self.tile, self.picture[0]), min(self.tile, self.picture[1]))
+        height, width = self.square = self.picture  # what is convolved at once
+        if self.border != "dark" and self.tile is not None:
+            self.square = (min(self.tile, height), min(self.tile, width))
+        elif self.border != "dark" and height * width > _WHOLE:  # far from the processor: in even parts
+            self.square = (-(-height // -(-height // _SIDE)), -(-width // -(-width // _SIDE)))
         self.squares = (-(-self.picture[0] // self.square[0]), -(-self.picture[1] // self.square[1]))
 
     @functools.cached_property
