@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,11 @@ from draws import Draw
 from torch import Tensor, nn
 
 from kcam import Camera, Scene, optics, sensor
+from kcam.optics.compound.images import QUICK
+from kcam.optics.numerics import fast_length
+from kcam.optics.propagation import sampling
 from kcam.optics.rendering.resampling import resampling
+from kcam.optics.source import PixelGrid
 from kcam.units import mm, nm, um
 
 DOUBLE = torch.float64
@@ -408,3 +413,27 @@ def test_a_point_of_a_preset_lands_at_its_image_point(name: str) -> None:
         expected = (middle - lens.image_point(LINES[1:2], **where)[0, 0, 0]) / pitch - centroid(psf, k, k)
         picture = imaging(Scene.from_bands(light, wavelengths=LINES[1:2], depth=5.0))[0, 0]
         assert float((centroid(picture, x, y) - expected).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_transform_that_is_just_long_enough(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points in a pixel follow from a wavelength by a product and a quotient: rounded up, they once needed one more."""
+    draw = random.Random(seed)
+    while True:
+        per_pixel, half, wavelength = draw.randrange(5, 24) / 4, draw.randrange(20, 60), draw.uniform(4.2e-7, 7e-7)
+        margin = half + QUICK.margin
+        points = math.ceil(per_pixel * margin)
+        rounded = math.ceil(per_pixel * wavelength / wavelength * margin)
+        if rounded > points and fast_length(2 * points + 1) <= 2 * points + 2:
+            break
+    lens, own = small(stop=0.25), torch.tensor([wavelength], dtype=DOUBLE)
+    pixels = PixelGrid(4e-6, (2 * half, 2 * half), 1.0, True, DOUBLE, torch.device("cpu"))
+
+    def psf() -> Tensor:
+        return lens.over_field(1e-4, torch.tensor([1.0], dtype=DOUBLE), own).bank(
+            torch.zeros(1, 2, dtype=DOUBLE), pixels
+        )
+
+    usual = psf()
+    monkeypatch.setattr(sampling, "points_per_pixel", lambda **_: per_pixel)
+    assert float((psf() - usual).abs().sum()) < 2e-3

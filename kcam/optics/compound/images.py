@@ -271,7 +271,7 @@ def images(
             openings = Openings(edge_distance(low @ _limiting(clearances[:, colours]).to(pixels.dtype) @ low.mT))
             lights = []
             for index, wavelength in enumerate(wavelengths.tolist()):
-                points_per_pixel = per_pixel * shortest / wavelength
+                points_per_pixel = per_pixel * (shortest / wavelength)  # so rounded it is never above per_pixel
                 points = math.ceil(points_per_pixel * margin)
                 tilt = (math.pi * points * count / length) * chebyshev_points  # brings the image's first point to 0
                 waves = path[:, index] * (2 * math.pi / wavelength) - tilt - tilt[:, None]
