@@ -119,6 +119,7 @@ class Imaging(Stage):
         self._warns = True  # of too few layers
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
         self._traced_cache, self._field_cache = ValueCache(_TRACED), ValueCache()
+        self._window_cache = ValueCache(_TRACED)
         self._reach: float | None = None  # from the axis, of the picture of which this is a part [m]
         self._check_recipe()
 
@@ -150,7 +151,8 @@ class Imaging(Stage):
         """
         changed = Imaging(**(self.configuration() | arguments))
         changed._warns = self._warns and "layers" not in arguments
-        changed._traced_cache, changed._reach = self._traced_cache, self._reach
+        changed._traced_cache, changed._window_cache = self._traced_cache, self._window_cache
+        changed._reach = self._reach
         if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
             changed._field_cache = self._field_cache
         return changed
@@ -158,7 +160,7 @@ class Imaging(Stage):
     def fresh(self) -> Imaging:
         """The same stage that has kept nothing, but for the pupils that were traced."""
         own = self.changed()
-        own._field_cache = ValueCache()
+        own._field_cache, own._window_cache = ValueCache(), ValueCache(_TRACED)
         return own
 
     def _check_recipe(self) -> None:
@@ -215,7 +217,9 @@ class Imaging(Stage):
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
         if not self.varies:
-            return _within(self.lens.window(Points(vergences), wavelengths, pixels), picture)
+            key = (self.lens, vergences, wavelengths, pixels)
+            own = self._window_cache.get(key, lambda: self.lens.window(Points(vergences), wavelengths, pixels))
+            return _within(own, picture)
         return _within(self._traced(picture, vergences, wavelengths).window(pixels), picture)
 
     def depth_layers(self, depth: Tensor, wavelengths: Tensor, *, waves: float = LAYER_WAVES) -> Tensor:
@@ -293,10 +297,10 @@ class Imaging(Stage):
         changes. The caller's own: it may be changed in place.
         """
         psfs = self._grouped_bank(wavelengths, points=Points(vergences), shape=shape, like=like)
-        owner = self._groups(wavelengths)
+        owner = self.groups(wavelengths)
         return psfs.clone() if owner is None else psfs[:, owner.to(psfs.device)]
 
-    def _groups(self, wavelengths: Tensor) -> Tensor | None:
+    def groups(self, wavelengths: Tensor) -> Tensor | None:
         """Which PSF each band takes, (L,), where several take one; None where each has its own."""
         count = len(wavelengths)
         if self.accuracy.blur and (self.accuracy.bands is None or self.accuracy.bands >= count):
@@ -307,9 +311,9 @@ class Imaging(Stage):
             owner[group] = index
         return owner
 
-    def _psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
+    def psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
         """At which the PSFs are computed: the bands', or the means of their groups'."""
-        owner = self._groups(wavelengths)
+        owner = self.groups(wavelengths)
         if owner is None:
             return wavelengths
         sums = wavelengths.new_zeros(int(owner.max()) + 1).index_add_(0, owner, wavelengths)
@@ -322,7 +326,7 @@ class Imaging(Stage):
 
         def build() -> Tensor:
             pixels = self.pixels(shape, like)
-            psfs = self.bank(points, self._psf_wavelengths(wavelengths), pixels)
+            psfs = self.bank(points, self.psf_wavelengths(wavelengths), pixels)
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.accuracy.renormalise else psfs
 
         # the whole stage, lens and all: what the PSFs depend on is not listed by hand
@@ -382,7 +386,7 @@ class Imaging(Stage):
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
         channels = None if layers > 1 and self.accuracy.per_band else channels
-        grouped = self._psf_wavelengths(scene.wavelengths)
+        grouped = self.psf_wavelengths(scene.wavelengths)
         groups = len(grouped)
         if self.varies:
             psfs = self._traced((height, width), vergences, scene.wavelengths)
@@ -432,7 +436,7 @@ class Imaging(Stage):
         zones = math.prod(nodes)
         places = float(zones if self.centre else math.prod((n + 1) // 2 for n in nodes))  # others mirror these
         tried = 0 if own.spacing is not None or not own.field_variation else PROBED
-        groups = len(self._psf_wavelengths(scene.wavelengths))
+        groups = len(self.psf_wavelengths(scene.wavelengths))
         computed = float(min(groups, _COLOURS))
         colours = 4.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
         sides = [min(n, math.ceil(2 * n / max(1, k - 1))) for n, k in zip(picture, nodes, strict=True)]
@@ -528,7 +532,7 @@ class Imaging(Stage):
         self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor, *, traced: FieldPSFs | None = None
     ) -> FieldPSFs:
         """PSFs of all places of a picture, traced once for all ways to group the wavelengths."""
-        grouped, lateral = self._psf_wavelengths(wavelengths), self.accuracy.lateral_colour
+        grouped, lateral = self.psf_wavelengths(wavelengths), self.accuracy.lateral_colour
         corner = self.reach(picture) if self._reach is None else self._reach
 
         def build() -> FieldPSFs:
@@ -542,7 +546,7 @@ class Imaging(Stage):
         """Those of all wavelengths, which the groups of any number take theirs from."""
         lens: Any = self.lens  # which `varies` has made sure of
         corner = self.reach(picture) if self._reach is None else self._reach
-        own = wavelengths if len(wavelengths) > _FEW_TRACED else self._psf_wavelengths(wavelengths)
+        own = wavelengths if len(wavelengths) > _FEW_TRACED else self.psf_wavelengths(wavelengths)
         return self._traced_cache.get(
             (self.lens, corner, vergences, own), lambda: lens.over_field(corner, vergences, own)
         )
@@ -555,7 +559,7 @@ class Imaging(Stage):
         rendering = self._rendering(scene) | {"border": "zero", "cache": None, "weights": weights, "spectra": spectra}
         mixing, mixed = None, False
         if weights is not None:
-            groups = len(self._psf_wavelengths(scene.wavelengths))
+            groups = len(self.psf_wavelengths(scene.wavelengths))
             sums = Renderer(like.new_empty(1, groups, 1, 1), **rendering).mixing()
             channels, count = sums.shape[:2]
             mixing = sums.flatten(0, 1)
@@ -662,5 +666,5 @@ class Imaging(Stage):
     def _rendering(self, scene: Scene) -> dict[str, Any]:
         """What a `Renderer` is told beside its tensors."""
         own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
-        owner, cache = self._groups(scene.wavelengths), self._transfer_cache
+        owner, cache = self.groups(scene.wavelengths), self._transfer_cache
         return own | {"border": self.border, "picture": tuple(scene.shape[-2:]), "owner": owner, "cache": cache}

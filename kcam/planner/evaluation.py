@@ -1,15 +1,12 @@
-"""What a choice changes in the noiseless raw: tried out on the scene, or on a few crops of it.
+"""What a choice changes in the noiseless raw: from spectra, or tried out on the scene, or on a few crops of it.
 
-    E^2 = sum_c share_c sum_f | sum_l kappa_cl I_l(f) (H_l(f) - G_l(f)) |^2
+By spectra where the raw is linear in the light, see `spectra`: then no picture is rendered, and the choices of a plan
+add up. Else a choice is tried out: inside the camera's own borders, mosaic, layers and full well. It is cheap because
+it is tried beside others that are cheap: few wavelengths, few layers of depth. Where follows from a `survey`: the items
+and tiles where a choice could hurt most, and what share of the picture they stand for.
 
-is what replacing the transfer functions H by G changes. By Parseval it is the energy of a picture, and is computed as
-one: amplitudes added over wavelengths before squaring, inside the camera's own borders, mosaic, layers and full well,
-so that none of the caveats of a formula in radial averages applies (numerics note, section 11). It is cheap because a
-choice is tried beside others that are cheap: few wavelengths, few layers of depth. Where it is tried follows from a
-`survey`: the items and tiles where a choice could hurt most, and what share of the picture they stand for.
-
-The last trial is of the whole plan against the reference, on all that was planned for, or on the worst `WITNESSED`
-pixels of it.
+What trials of one choice tell little of another's ends with a last trial, of the whole plan against the reference, on
+all that was planned for, or on the worst `WITNESSED` pixels of it.
 """
 
 from __future__ import annotations
@@ -39,7 +36,8 @@ from kcam.planner.plan import (
     shortened,
     with_imaging,
 )
-from kcam.planner.survey import KINDS, TILE, Survey, survey
+from kcam.planner.spectra import LINEAR, Spectra, linear
+from kcam.planner.survey import BEYOND, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter
 from kcam.sensor.noise import RandomStage
@@ -64,6 +62,11 @@ class Sample:
     factors: tuple[float, ...]
     places: tuple[tuple[float, float], ...] | None = None
     picture: tuple[int, int] = (0, 0)
+
+    def of_owners(self) -> list[tuple[list[int], float]]:
+        """The rows of each whole, and the factor on their error."""
+        wholes = dict(zip(self.owners, self.factors, strict=True))
+        return [([row for row, own in enumerate(self.owners) if own == whole], f) for whole, f in wholes.items()]
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,46 @@ class Evaluator:
         self.witnesses = _samples(full, self.surveys, pixels=WITNESSED)
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
         self.scenes = full
+        self.spectra: list[Spectra] | None = None
+        if self.imaging is not None and not self.gradients and not self.varies and self._is_linear():
+            self.spectra = [
+                Spectra(self.raw_camera, self.imaging, sample.scene, picture=sample.picture) for sample in self.samples
+            ]
+
+    @functools.cached_property
+    def certain(self) -> bool:
+        """Whether what choices cost is known without trying all of them together: of linear optics, and one scene where
+        things hide others.
+        """
+        deep = any(float(one.far.min()) < float(one.near.max()) for own in self.surveys for one in own)
+        if self.spectra is None or (deep and sum(map(len, self.surveys)) > 1):
+            return False
+        return all(spectra.fits for spectra in self.spectra)
+
+    def tabled(self, settings: Mapping[str, Any]) -> bool:
+        """Whether all wavelengths may be compared at no cost."""
+        return self.spectra is not None and all(spectra.tabled(settings) for spectra in self.spectra)
+
+    def _is_linear(self) -> bool:
+        """Whether the raw is, as far as these scenes go."""
+        if not linear(self.raw_camera) or any(bool(one.potential[BEYOND].any()) for own in self.surveys for one in own):
+            return False
+        tiles = any(isinstance(stage, ColourFilter) and stage.is_tile for stage in self.raw_camera)
+        # of filters that differ from pixel to pixel the survey knows the mean
+        return not tiles or all(float(one.raw.max()) < 1 for one in self.answers({"blur": False}) if one.raw.numel())
 
     def error(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
         """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes."""
-        return _error(self.samples, self.answers(changes), self.answers(against))
+        known = (changes.keys() | against.keys()) <= LINEAR and changes.get("layers") == against.get("layers")
+        if self.spectra is None or not known:
+            return _error(self.samples, self.answers(changes), self.answers(against))
+        found = [0.0]
+        for sample, spectra in zip(self.samples, self.spectra, strict=True):
+            energies = torch.stack(spectra.energies(changes, against))
+            for rows, factor in sample.of_owners():
+                off, all_of_it = energies[:, rows].sum(1).tolist()
+                found.append(factor * math.sqrt(off / all_of_it) if all_of_it else 0.0)
+        return max(found)
 
     def last(self, changes: Mapping[str, Any], skipped: Sequence[int]) -> float:
         """True error of a finished plan on all that it is for, or on the worst of it: the worst over the scenes."""
@@ -224,8 +263,7 @@ def _error(samples: Sequence[Sample], ours: Sequence[Answer], theirs: Sequence[A
     """
     found = [0.0]
     for sample, one, other in zip(samples, ours, theirs, strict=True):
-        for owner, factor in dict(zip(sample.owners, sample.factors, strict=True)).items():
-            rows = [row for row, whose in enumerate(sample.owners) if whose == owner]
+        for rows, factor in sample.of_owners():
             if bool(other.raw[rows].any()):
                 found.append(factor * relative_rms(one.raw[rows], other.raw[rows]))
         found += [relative_rms(a, b) for a, b in zip(one.gradients, other.gradients, strict=True) if bool(b.any())]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -16,13 +17,14 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
 from kcam.planner.evaluation import CROP, Evaluator
+from kcam.planner.spectra import FEW_BANDS, even_counts
 from kcam.scene import Scene
 
-FEW_BANDS, FEW_LAYERS, TAIL = 3, 3, 16
-"""Of the settings beside which a choice is priced: wavelengths, layers, and pixels of the PSF beyond its rays."""
+FEW_LAYERS, TAIL = 3, 16
+"""Of the settings beside which a choice is priced: layers, and pixels of the PSF beyond its rays."""
 
-ORDER = 1.5
-"""A ladder's error falls at least with this power of its step: two where it is fine enough, one where phases jump."""
+ORDERS = (1.0, 1.5)
+"""A ladder's error falls at least with such a power of its step: one where phases jump, two where it is fine enough."""
 
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
@@ -46,8 +48,8 @@ class Level:
 class Ladder:
     """A choice: its rungs from the cheapest to the reference, the settings beside which it is priced, and where it is.
 
-    successive: an error is that against the next rung, and what is left beyond it by the order of convergence: for
-    ladders whose top costs as much as the reference picture. Else it is that against the top.
+    successive: an error follows from the steps between rungs, by their order of convergence: for ladders whose top
+    costs as much as the reference picture. Else it is that against the top.
     blurs: whether it only matters where there is blur.
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers.
@@ -66,6 +68,7 @@ class Ladder:
     urgency: float = 1.0
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
+    compared: set[tuple[int, int]] = field(default_factory=set)
 
     @property
     def level(self) -> Level:
@@ -93,19 +96,45 @@ class Ladder:
         if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing, one PSF has one colour
             self.errors[key] = 0.0
             return
+        if self.successive:
+            self.errors[key] = self._beyond(evaluator)
+            return
         beside = self.beside | (self.follows.level.changes if self.follows else {})
-        upper = self.levels[self.position + 1] if self.successive else self.levels[-1]
         candidates = [self.level] + (self.alternatives(self.level) if self.alternatives else [])
-        errors = [evaluator.error(beside | level.changes, beside | upper.changes) for level in candidates]
+        top = beside | self.levels[-1].changes
+        errors = [evaluator.error(beside | level.changes, top) for level in candidates]
         best = min(range(len(errors)), key=errors.__getitem__)
-        self.levels[self.position] = candidates[best]
-        error = errors[best]
-        if self.successive and self.position + 2 < len(self.levels):
-            error /= 1 - (self.level.fineness / upper.fineness) ** ORDER
-        self.errors[key] = error
+        self.levels[self.position], self.errors[key] = candidates[best], errors[best]
+
+    def _beyond(self, evaluator: Evaluator) -> float:
+        """What is left from here to where rungs converge, by the steps up to here: that of the foot by the next one.
+
+        Of order p, e = step r / (1 - r), r = (fineness below / fineness)^p; p from two steps, if there are two.
+        """
+        if self.position == 0:
+            return self._by_the_next(evaluator)
+        known = [self.beside | level.changes for level in self.levels[max(0, self.position - 2) : self.position + 1]]
+        steps = [evaluator.error(below, above) for below, above in pairwise(known)]
+        last = self.level.fineness / self.levels[self.position - 1].fineness
+        order = ORDERS[0]
+        if len(steps) > 1 and 0 < steps[1] < steps[0]:
+            order = min(max(math.log(steps[0] / steps[1]) / math.log(last), order), ORDERS[1])
+        return steps[-1] / (last**order - 1)
+
+    def _by_the_next(self, evaluator: Evaluator) -> float:
+        """What is left from here, by the step to the next rung and the order from there on."""
+        upper = self.levels[self.position + 1]
+        step = evaluator.error(self.beside | self.level.changes, self.beside | upper.changes)
+        last = self.position + 2 == len(self.levels)
+        return step if last else step / (1 - (self.level.fineness / upper.fineness) ** ORDERS[1])
 
     def climb(self, evaluator: Evaluator) -> None:
-        """One rung up, and its error."""
+        """One rung up, and its error; first, what that rung says of this one, which may then do."""
+        key, two_up = self._key(self.position), self.position + 2
+        if self.successive and self.position > 0 and two_up < len(self.levels) and key not in self.compared:
+            self.compared.add(key)
+            self.errors[key] = self._by_the_next(evaluator)
+            return
         self.position += 1
         self.price(evaluator)
 
@@ -146,6 +175,7 @@ class _View:
             self.row = None if imaging.varies else imaging.accuracy.row(query)
         elif evaluator.varies:
             self.blur = float(evaluator.defocus.radius(ends).max()) * imaging.pixel_pitch
+        self.evaluator = evaluator
         self.apart = evaluator.apart if evaluator.varies else None
         self.largest = CROP if any(sample.places for sample in evaluator.samples) else max(scene.shape[1:])
         self.trained = any(p.requires_grad for p in imaging.parameters())
@@ -220,24 +250,11 @@ def _precision(view: _View) -> Iterator[Ladder]:
         yield Ladder("precision", levels, view.beside)
 
 
-def even_counts(total: int) -> list[int]:
-    """Numbers of groups, ascending, each about twice the one before; those into which `total` divides evenly first.
-
-    Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are closer to all than 12
-    are, and 14 than 23.
-    """
-    counts = [1]
-    while counts[-1] < total:
-        near = range(math.ceil(1.5 * counts[-1]), math.floor(2.5 * counts[-1]) + 1)
-        even = [count for count in near if total % count == 0]
-        counts.append(even[-1] if even else 2 * counts[-1])
-    return [count for count in counts if count < total]
-
-
 def _wavelengths(view: _View) -> Iterator[Ladder]:
     levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in even_counts(view.bands)]
     top = Level(f"{view.bands} PSFs", {}, view.bands)
-    yield Ladder("wavelengths", [*levels, top], view.few(bands=False), successive=True)
+    beside = view.few(bands=False)
+    yield Ladder("wavelengths", [*levels, top], beside, successive=not view.evaluator.tabled(beside))
 
 
 def _rank(view: _View) -> Iterator[Ladder]:

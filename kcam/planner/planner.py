@@ -45,9 +45,11 @@ def make_plan(
     """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
 
     A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
-    until the sum of all errors is below the tolerance / `SAFETY`, and on until the last trial is: the whole plan
-    against the reference, each item of each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the
-    worst of them. The way up does not depend on the tolerance: with a smaller one it goes further.
+    until the sum of all errors is below the tolerance / `SAFETY`. Where the raw is linear in the light, those follow
+    from spectra. Else (light beyond the full well, PSFs that vary over the picture, gradients, a batch with depth) they
+    are tried out, and the way goes on until a last trial fits: the whole plan against the reference, each item of each
+    batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them. The way up does not depend on
+    the tolerance: with a smaller one it goes further.
 
     Args:      scenes: one or several, of the same wavelengths.
                tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this
@@ -84,7 +86,7 @@ class Planner:
         check_tolerance(tolerance)
         rows = _Rows(self.prices)
         skipped: list[int] = []
-        allowed = checked = 0.0
+        allowed, checked = 0.0, None
         if tolerance != 0 and self.evaluator.samples:
             ladders, skips, signals = self._ways()
             noise = self.evaluator.noise(signals)
@@ -108,7 +110,7 @@ class Planner:
         return Plan(
             tolerance=tolerance,
             allowed=allowed,
-            bound=max(sum(errors), checked),
+            bound=max(sum(errors), checked or 0.0),
             expected=math.sqrt(sum(error**2 for error in errors)),
             checked=checked,
             decisions=tuple(rows.decisions),
@@ -132,11 +134,15 @@ class Planner:
             planning_seconds=self._setup + time.perf_counter() - start,
         )
 
-    def _settle(self, steps: list[Ladder], skips: list[_Skip], allowed: float, noise: float | None) -> float:
-        """Climb until the estimates fit, and on until the last trial does; gives the error that it found."""
+    def _settle(self, steps: list[Ladder], skips: list[_Skip], allowed: float, noise: float | None) -> float | None:
+        """Climb until the estimates fit, and where those of one choice tell little of another's on until the last trial
+        does; gives the error that it found.
+        """
         counted = [skip for skip in skips if skip.counted]
         while True:
             _climb(steps, counted, self.evaluator, allowed / SAFETY)
+            if self.evaluator.certain:
+                return None
             ways: list[Any] = [*_relevant(steps), *counted]
             below = [way for way in ways if not way.at_top]
             if not below:

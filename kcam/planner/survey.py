@@ -42,8 +42,8 @@ KINDS = (
 )
 """What a tile may have much of."""
 
-OF_DEPTH, NEIGHBOURS = KINDS[2:5], 5
-"""The kinds that nothing but depth makes hurt; which is the contrast between neighbours."""
+OF_DEPTH, NEIGHBOURS, BEYOND = KINDS[2:5], 5, 6
+"""The kinds that nothing but depth makes hurt; the contrast between neighbours; and what the full well cuts off."""
 
 
 @dataclass(frozen=True)

@@ -267,7 +267,7 @@ def _amplitude(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
     rho = (rho + 1) / 2
     phase = rim[..., None] * rho**2
     field = torch.stack([phase.cos(), phase.sin()]) * (rho * weights / (2 * math.pi))
-    return field @ _kept_kernel(nodes, arguments, rim.device)
+    return field @ hankel_kernel(rho, arguments, step=_STEP)
 
 
 def _projected(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
@@ -314,13 +314,6 @@ class _Fresnel(torch.autograd.Function):
         if abs(float(rim)) > 1e-4:
             slope = (chord * phasor(phase) - result) / (2 * rim)
         return (grad.conj() * slope).real.sum(), None
-
-
-@functools.lru_cache(maxsize=12)
-@torch.inference_mode(False)  # what is kept must serve training too
-def _kept_kernel(nodes: int, arguments: int, device: torch.device) -> Tensor:
-    rho = torch.as_tensor(legendre(nodes)[0], device=device) / 2 + 0.5
-    return hankel_kernel(torch.arange(arguments, dtype=torch.float64, device=device) * _STEP, rho)
 
 
 @functools.lru_cache(maxsize=16)

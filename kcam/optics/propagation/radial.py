@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from kcam.cache import ValueCache
 from kcam.optics.numerics import BesselJ0, lagrange
 from kcam.optics.propagation.estimates import paraxial_error, trace
 from kcam.optics.propagation.question import Query, radial_phase, residual_path
@@ -19,6 +20,10 @@ from kcam.optics.pupil.coordinates import Pupil, from_image_side
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
 _MOST_RINGS = 2**20
 _RINGS_AT_ONCE = 2**24  # entries of the Hankel table: 128 MB
+_KERNELS, _KEPT = ValueCache(8), 2**22  # the last tables, and entries of one that is kept: 34 MB
+_EVEN = 128  # steps by which tables grow, so that a lens that is focused anew finds its own
+_FEWEST, _PER_FRINGE = 256, 2  # frequencies in a table of transfer functions, in all and for each fringe
+_CUBIC = range(-1, 3)
 LOOKUPS = Rate("radial", 1.5e-10)
 """Of operations of which most look numbers up."""
 
@@ -32,26 +37,7 @@ def radial_psf(query: Query) -> Tensor:
     wavelengths = query.wavelengths.to(query.device)
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
-    largest = float(scales.detach().max())
-    corner = math.sqrt(2) * query.half_window
-    rho, weights = ring_nodes(query, largest * corner)
-
-    x, y = from_image_side(rho, torch.zeros_like(rho), query.tau)
-    pupil = query.pupil(x, y)
-    coefficients, maps = residual_path(query, pupil)
-    phase = 2 * math.pi / wavelengths[:, None, None] * (coefficients @ maps)  # (L, Z, n)
-    amplitude, energy = ring_amplitude(query, pupil, rho * weights)
-    field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
-    field, rho = fewer_nodes(field, rho, frequency=largest * corner)
-
-    steps = math.ceil(largest * corner / _TABLE_STEP) + 8
-    t = torch.arange(steps, dtype=torch.float64, device=query.device) * _TABLE_STEP
-    parts = list(zip(*(part.split(max(1, _RINGS_AT_ONCE // t.numel()), dim=-1) for part in (field, rho)), strict=True))
-    if len(parts) == 1:
-        transformed = _hankel(field, t, rho)  # (2, L, Z, T)
-    else:  # the table of each part is built again in the backward pass, not kept
-        transformed = torch.stack([checkpoint(_hankel, f, t, r, use_reentrant=False) for f, r in parts]).sum(0)
-
+    transformed, energy = _transformed(query, scales)
     bands = []
     for index, wavelength in enumerate(query.wavelengths.tolist()):
         arguments = (transformed[:, index], scales[index], query, wavelength)
@@ -65,13 +51,88 @@ def radial_psf(query: Query) -> Tensor:
     return torch.stack(bands, dim=1)
 
 
-def hankel_kernel(t: Tensor, rho: Tensor) -> Tensor:
-    """2 pi J0(t rho), (n, T): what a field over rings (..., n) is multiplied with."""
-    return 2 * math.pi * BesselJ0.apply(t[:, None] * rho).T
+def _transformed(query: Query, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """U at t = 0, `_TABLE_STEP`, ... as far as the window's corner, (2, L, Z, T); the energy that passes, (1 or Z,).
+
+    Args: scales: (L,) t per metre on the sensor.
+    """
+    wavelengths = query.wavelengths.to(query.device)
+    largest = float(scales.detach().max())
+    corner = math.sqrt(2) * query.half_window
+    rho, weights = ring_nodes(query, largest * corner)
+    x, y = from_image_side(rho, torch.zeros_like(rho), query.tau)
+    pupil = query.pupil(x, y)
+    coefficients, maps = residual_path(query, pupil)
+    phase = 2 * math.pi / wavelengths[:, None, None] * (coefficients @ maps)  # (L, Z, n)
+    amplitude, energy = ring_amplitude(query, pupil, rho * weights)
+    field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
+    field, rho = fewer_nodes(field, rho, frequency=largest * corner)
+    steps = math.ceil(largest * corner / _TABLE_STEP) + 8
+    parts = list(zip(*(part.split(max(1, _RINGS_AT_ONCE // steps), dim=-1) for part in (field, rho)), strict=True))
+    if len(parts) == 1:
+        return _hankel(field, steps, rho), energy
+    # the table of each part is built again in the backward pass, not kept
+    return torch.stack([checkpoint(_hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
 
 
-def _hankel(field: Tensor, t: Tensor, rho: Tensor) -> Tensor:
-    return field @ hankel_kernel(t, rho)
+def radial_transfer(query: Query, frequencies: Tensor) -> Tensor:
+    """Transfer functions of a rotationally symmetric pupil, of light on pixels, without a picture of its PSF.
+
+    H(f) = 1 / (2 pi E) INT |U(t)|^2 J0(kappa t) t dt,   kappa = f lambda d / a
+
+    of what falls into a disc of the window's area, times that of a pixel, and folded at the pixels' own frequency.
+
+    Args:      frequencies: (F,) along an axis of the pixels [cycles per pixel].
+    Returns:   (Z, L, 2, F) float64, the same along x and y.
+    """
+    wavelengths = query.wavelengths.to(query.device)
+    a, d = query.image_side_semi_aperture, query.sensor_distance
+    scales = 2 * math.pi / wavelengths * a / d
+    transformed, energy = _transformed(query, scales)
+    t = torch.arange(transformed.shape[-1], dtype=torch.float64, device=query.device) * _TABLE_STEP
+    disc = scales * query.pixel_pitch * math.sqrt(math.prod(query.shape) / math.pi)
+    inside = ((disc[:, None] - t) / _TABLE_STEP + 0.5).clamp(0, 1)
+    intensity = transformed.square().sum(0) * inside[:, None]  # (L, Z, T)
+    count = max(_FEWEST, math.ceil(_PER_FRINGE * 2 * float(t[-1]) / math.pi))
+    steps = 2 / (count - 1)  # of kappa, which ends at 2
+    kernel = hankel_kernel(t, count, step=steps) / (2 * math.pi)  # (T, count)
+    # the trapezium rule, with Euler and Maclaurin's correction for the slope at the axis
+    table = (intensity * t) @ kernel * _TABLE_STEP + _TABLE_STEP**2 / 12 * intensity[..., :1]
+    table = table / (2 * math.pi * energy[:, None])
+    folds = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64, device=query.device)
+    along, across = frequencies[:, None, None] + folds[:, None], folds
+    pixel = torch.sinc(along * query.grid.active) * torch.sinc(across * query.grid.active)
+    if not query.grid.integrate:
+        pixel = torch.ones_like(pixel)
+    radius = torch.sqrt(along**2 + across**2) / query.pixel_pitch  # (F, 3, 3)
+    place = (wavelengths[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is nothing
+    low = place.detach().long().clamp(max=count - 3)
+    value = torch.zeros(())
+    for tap, weight in zip(_CUBIC, lagrange(place - low, taps=_CUBIC), strict=True):
+        index = (low + tap).abs()[:, None].expand(-1, table.shape[1], -1)  # even
+        value = value + weight[:, None] * table.gather(-1, index)
+    found = (value.unflatten(-1, radius.shape) * pixel).sum((-2, -1))
+    return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
+
+
+def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
+    """2 pi J0(t rho) at t = 0, step, ..., (n, steps): what a field over rings (..., n) is multiplied with.
+
+    A table that is not large is kept for others with the same rings: most of the time of one PSF goes into it.
+    """
+
+    def build(count: int) -> Tensor:
+        t = torch.arange(count, dtype=torch.float64, device=rho.device) * step
+        return 2 * math.pi * BesselJ0.apply(t[:, None] * rho).T
+
+    count = _EVEN * math.ceil(steps / _EVEN)
+    if rho.numel() * count > _KEPT:
+        return build(steps)
+    return _KERNELS.get((rho, count, step), lambda: build(count))[:, :steps]
+
+
+def _hankel(field: Tensor, steps: int, rho: Tensor) -> Tensor:
+    return field @ hankel_kernel(rho, steps, step=_TABLE_STEP)
 
 
 def ring_nodes(query: Query, frequency: float, *, density: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -153,5 +214,6 @@ RADIAL = Propagator(
     cost=lookup_cost,
     rate=LOOKUPS,
     valid=_needs_symmetry,
+    transfer=radial_transfer,
     about="one Hankel transform",
 )

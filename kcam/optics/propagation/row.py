@@ -37,6 +37,8 @@ class Propagator(nn.Module):
             product. A number is for operations of a kind of its own; a `Rate` may be that of other rows.
         exact: whether only sampling separates the row from its physics, so that it may be chosen by cost alone.
         on_grid: whether it samples the pupil on a Cartesian grid, of so many samples as `Query.samples` says.
+        transfer: (query, frequencies (F,) [cycles per pixel]) -> transfer functions (Z, L, 2, F) along x and y, where
+            they are known without the PSFs.
         about: what it does, in a line of the documentation.
     Raises: ValueError for a rate that is not > 0.
     """
@@ -54,13 +56,14 @@ class Propagator(nn.Module):
         paraxial: bool = False,
         exact: bool = True,
         on_grid: bool = False,
+        transfer: Callable[[Query, Tensor], Tensor] | None = None,
         about: str = "",
     ) -> None:
         super().__init__()
         self.physics, self.method, self.paraxial, self.exact = physics, method, paraxial, exact
         self.function, self.error_of, self.cost_of, self.reason_of = function, error, cost, valid
         self.kind, self.rate = rate if isinstance(rate, Rate) else (f"{physics}/{method}", float(rate))
-        self.on_grid, self.about = on_grid, about
+        self.on_grid, self.transfer_of, self.about = on_grid, transfer, about
         if not self.rate > 0:
             raise ValueError(f"rate must be > 0 seconds for an operation of {physics}/{method}, got {self.rate:g}.")
 
@@ -80,6 +83,12 @@ class Propagator(nn.Module):
             raise ValueError(f"{self.physics}/{self.method} {reason}")
         with full_precision(query.device):
             return self.function(query.modelled(paraxial=self.paraxial))
+
+    def transfer(self, query: Query, frequencies: Tensor) -> Tensor | None:
+        """Transfer functions (Z, L, 2, F) of slices along x and y, or None where only the PSFs tell."""
+        if self.transfer_of is None or self.valid_for(query) is not None:
+            return None
+        return self.transfer_of(query.modelled(paraxial=self.paraxial), frequencies)
 
     def valid_for(self, query: Query) -> str | None:
         """Why the row cannot answer a query, or None."""

@@ -1,0 +1,91 @@
+"""Errors from spectra are those of pictures, and transfer functions those of PSFs."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from draws import Draw
+
+from benchmarks.planner import random_pair
+from kcam import optics
+from kcam.optics.propagation.radial import RADIAL
+from kcam.optics.source import PixelGrid, Points
+from kcam.planner.evaluation import Evaluator, _error
+from kcam.planner.ladders import Ladder, Level
+from kcam.planner.spectra import even_counts
+from kcam.units import mm, um, wavelength_grid
+
+CHANGES = [
+    ({"bands": 3, "blur": False}, {"bands": 3}),
+    ({"bands": 1}, {"bands": 2}),
+    ({"bands": 4}, {"bands": 7}),
+    ({"bands": 2, "psf_shape": (9, 9)}, {"bands": 2}),
+    ({"bands": 2, "psf_shape": (33, 17), "renormalise": True}, {"bands": 2}),
+]
+
+
+@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 40))])
+def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
+    """Cameras and scenes of benchmarks/planner.py: at one distance to a third, but where a window as large as the
+    picture is smaller than the blur; with depth, where things hide others, not much too small.
+    """
+    camera, scene, text, _ = random_pair(seed, longest=1.0)
+    with torch.no_grad():
+        evaluator = Evaluator(camera, [scene])
+        if evaluator.spectra is None:
+            pytest.skip("some of its light is beyond the full well: then pictures are tried")
+        flat, fits = not isinstance(scene.depth, torch.Tensor), evaluator.certain
+        for ours, theirs in CHANGES:
+            trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers(theirs))
+            ratio = evaluator.error(ours, theirs) / max(trial, 1e-30)
+            if 1e-3 < trial < 1:
+                low, high = (0.7, 1.3) if flat and fits else (0.4, 1.4) if flat else (0.6, 4.0)
+                assert low < ratio < high, f"{text}: {ours} against {theirs}, {ratio:.3g} times {trial:.3g}"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_transfer_functions_are_those_of_the_psf(seed: int) -> None:
+    """Of a round lens: what falls into a disc as large as the window, so that the corners are all that differs."""
+    draw = Draw(seed)
+    glass = optics.PlanoConvexLens(25.8 * mm, glass="N-BK7")
+    focus = 1 / draw.number(0.1, 2)
+    lens = optics.Lens(optics.CircularAperture(draw.number(1, 6) * mm), glass, focus_distance=focus)
+    vergences = torch.tensor([1 / focus, 1 / focus + draw.number(-0.1, 0.1)], dtype=torch.float64)
+    pixels = PixelGrid(draw.number(2, 6) * um, (129, 129), 1.0, True, torch.float64)
+    wavelengths = wavelength_grid(count=4)
+    row = RADIAL if draw.one_of(True, False) else RADIAL.in_fresnel_range()
+    query = lens.question(Points(vergences), wavelengths, pixels)
+    frequencies = torch.linspace(0.05, math.sqrt(0.5), 60, dtype=torch.float64)
+    found, psfs = row.transfer(query, frequencies), row(query)
+    x = torch.arange(129, dtype=torch.float64) - 64
+    expected = psfs.sum(-2) @ torch.cos(2 * math.pi * x[:, None] * frequencies)
+    assert found.shape == (2, 4, 2, 60)
+    assert torch.equal(found[:, :, 0], found[:, :, 1])
+    torch.testing.assert_close(found[:, :, 0], expected, rtol=0, atol=3e-3)
+
+
+@pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("total", [28, 33, 9])
+def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int) -> None:
+    """Rungs that converge with an order between one and two: by the steps below, then by the next rung."""
+    counts = [*even_counts(total), total]
+    levels = [Level(str(n), {"bands": n}, n) for n in counts]
+
+    def left(n: float) -> float:
+        return n**-order
+
+    def step(ours: dict, theirs: dict) -> float:
+        return left(ours["bands"]) - left(theirs["bands"])
+
+    evaluator, ladder = SimpleNamespace(error=step), Ladder("wavelengths", levels, {}, successive=True)
+    ladder.price(evaluator)
+    seen = []
+    while not ladder.at_top:
+        truth = left(counts[ladder.position]) - left(total)
+        assert 0.65 * truth < ladder.error < 6 * truth, (counts[ladder.position], len(seen))
+        seen.append(ladder.position)
+        ladder.climb(evaluator)
+    assert len(seen) > len(set(seen))  # some were looked at twice before they were left
