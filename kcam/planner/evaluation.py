@@ -341,7 +341,7 @@ def _sample(
         part = [scene.samples([row]) for row in rows]
         crops, factors = [(row, 0, 0) for row in rows], dict.fromkeys(rows, 1.0)
     else:
-        part = [scene.samples([row]).crop(top=top, left=left, **size) for row, top, left in crops]
+        part = [scene.crop(top=top, left=left, **size).samples([row]) for row, top, left in crops]
     maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
     depth: float | Tensor = scene.depth
     if isinstance(depth, Tensor):  # maps, or numbers of one per sample
