@@ -1,4 +1,4 @@
-# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | bench-field | bench-style | bench-styles | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
+# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | bench-planner | bench-field | bench-style | bench-styles | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
 PYTHON ?= python3
 VENV ?= .venv
 PEERS ?= .venv-peers
@@ -11,7 +11,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-field bench-style bench-styles bench-data lint types check wheel-test clean
+.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-planner bench-field bench-style bench-styles bench-data lint types check wheel-test clean
 
 help:
 	@head -1 Makefile
@@ -53,6 +53,10 @@ bench: $(VENV)/dev.stamp
 
 bench-augmentation: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.augmentation
+
+# 300 random pairs of camera and scene and 100 hard ones, planned at five tolerances and measured: an hour.
+bench-planner: $(VENV)/dev.stamp
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.planner
 
 # Pictures over the field, up to 12 megapixels: an hour. PARTS=methods measures one part anew, the others stay.
 PARTS ?= pictures,growth,methods,gradient

@@ -22,12 +22,14 @@ import torch
 from torch import Tensor
 
 from kcam import Camera, Scene, isp, measure, optics, sensor
-from kcam.planner import Planner, relative_rms, timed
+from kcam.planner import Planner, make_plan, relative_rms, timed
 from kcam.units import mm, um, wavelength_grid
 
 TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
 LONGEST = 10.0  # seconds, predicted, of a reference picture
 SLOW = 5.0  # seconds of a reference picture above which one of each must do
+FIRST = (0.03, 0.01)  # tolerances at which the first picture is timed too: a plan of its own, and the picture
+SEEN, FELT = 0.1, 0.3  # seconds of a reference picture from which on the worst, and the median, of first pictures count
 SIDES = (48, 64, 96, 128, 160, 192)
 RESULTS = Path(__file__).parent / "results" / "planner.json"
 
@@ -323,6 +325,7 @@ def measure_pair(
     with torch.no_grad():
         planner = Planner(camera, scene)
         plans = [planner.plan(tolerance) for tolerance in tolerances]
+        first = {tolerance: make_plan(camera, scene, tolerance=tolerance).planning_seconds for tolerance in FIRST}
         reference, truth = timed(camera, scene)
         shots: list[list[tuple[float, Tensor]]] = [[] for _ in plans]
         references = [reference]
@@ -347,6 +350,7 @@ def measure_pair(
                 "predicted_seconds": plan.seconds,
                 "predicted_reference_seconds": plan.reference_seconds,
                 "planning_seconds": plan.planning_seconds,
+                "first_planning_seconds": first.get(tolerance),
                 "changes": plan.changes,
             }
         )
@@ -377,6 +381,30 @@ def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 ),
             }
         )
+    return rows
+
+
+def first_pictures(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What a plan is worth for one picture, planning included, where the reference takes long enough to be felt."""
+    rows = []
+    for tolerance in FIRST:
+        found = [row for pair in pairs for row in pair["tolerances"] if row["tolerance"] == tolerance]
+        found = [row for row in found if row["reference_seconds"] > SEEN]
+        gains = [row["reference_seconds"] / (row["first_planning_seconds"] + row["seconds"]) for row in found]
+        felt = [row for row in found if row["reference_seconds"] > FELT]
+        if felt:
+            own = [gain for gain, row in zip(gains, found, strict=True) if row["reference_seconds"] > FELT]
+            shares = [row["first_planning_seconds"] / row["reference_seconds"] for row in felt]
+            rows.append(
+                {
+                    "tolerance": tolerance,
+                    "pairs": len(felt),
+                    "planning_share": statistics.median(shares),
+                    "speed_up": statistics.median(own),
+                    "later_speed_up": statistics.median(row["reference_seconds"] / row["seconds"] for row in felt),
+                    "speed_up_least": min(gains),
+                }
+            )
     return rows
 
 
@@ -418,13 +446,15 @@ def main() -> None:
         "summary": summary(pairs),
         "drawn_again": again,
         "longest_seconds": LONGEST,
+        "first_pictures": first_pictures(pairs),
         "hard_summary": summary(hard_pairs) if hard_pairs else [],
+        "hard_first_pictures": first_pictures(hard_pairs),
         "failures": failures,
         "pairs": pairs,
         "hard_pairs": hard_pairs,
     }
     measure.write_json(arguments.out, content)
-    for row in [*content["summary"], *content["hard_summary"]]:
+    for row in [value for name in content if name.endswith(("summary", "pictures")) for value in content[name]]:
         print(row)
     print(f"{len(failures)} failures, {again} pairs drawn again")
 

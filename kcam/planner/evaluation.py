@@ -107,15 +107,13 @@ class Evaluator:
                 Spectra(self.raw_camera, self.imaging, sample.scene, picture=sample.picture) for sample in self.samples
             ]
 
-    @functools.cached_property
+    @property
     def certain(self) -> bool:
         """Whether what choices cost is known without trying all of them together: of linear optics, and one scene where
         things hide others.
         """
         deep = any(float(one.far.min()) < float(one.near.max()) for own in self.surveys for one in own)
-        if self.spectra is None or (deep and sum(map(len, self.surveys)) > 1):
-            return False
-        return all(spectra.fits for spectra in self.spectra)
+        return self.spectra is not None and not (deep and sum(map(len, self.surveys)) > 1)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether all wavelengths may be compared at no cost."""

@@ -10,6 +10,7 @@ occlusion, and each layer has transfer functions of its own.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ LINEAR = {"blur", "bands", "psf_shape", "renormalise", "kappa", "propagator", "l
 _OF_PSFS = ("psf_shape", "renormalise", "kappa")  # what changes PSFs, and no transfer function of the optics
 
 _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
+_CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 FEW_BANDS = 3
 """Wavelengths of the settings beside which a choice is priced."""
@@ -89,9 +91,9 @@ class Spectra:
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, psfs=seen) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
-            if len(layered.vergences) > 1 and self.imaging.accuracy.occlusion:
-                found[0, rows] *= _HIDDEN**2
-        return found[0], found[1]
+            hidden = len(layered.vergences) > 1 and self.imaging.accuracy.occlusion
+            found[0, rows] *= (_HIDDEN if hidden else 1.0) ** 2
+        return found[0] * (1.0 if self.fits else _CUT) ** 2, found[1]
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (C, K Z, 2, F), recorded, (B,)."""
@@ -149,7 +151,7 @@ class Spectra:
     def _window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
         return imaging.psf_window(self.scene.wavelengths, vergences=vergences, picture=self.picture)
 
-    @property
+    @functools.cached_property
     def fits(self) -> bool:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
         vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
@@ -191,7 +193,11 @@ class Spectra:
         known = self._banks.get(key)
         if known is None or any(n < m for n, m in zip(known.shape[-2:], window, strict=True)):
             pixels = imaging.pixels(window, imaging.working(self.scene)[:, :0])
-            known = self._banks[key] = imaging.bank(Points(vergences), wavelengths, pixels)
+            asked = wavelengths
+            if isinstance(imaging.lens, Lens) and imaging.lens.symmetric:  # with its ends any part finds the same rings
+                asked = torch.cat([wavelengths, torch.stack(self.scene.wavelengths.aminmax())])
+            found = imaging.bank(Points(vergences), asked, pixels)
+            known = self._banks[key] = found[:, : len(wavelengths)]
         for dim, length in zip((-2, -1), window, strict=True):
             known = known.narrow(dim, known.shape[dim] // 2 - length // 2, length)
         return known
