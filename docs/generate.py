@@ -380,6 +380,16 @@ def honesty_table() -> str:
         "took "
         f"{figures(content['summary'][0]['planning_share'])} times the reference's time in the median.",
     ]
+    for name, of in (("first_pictures", "pairs"), ("hard_first_pictures", "hard pairs")):
+        for row in content.get(name, []):
+            lines += [
+                "",
+                f"One picture, planning included, of the {row['pairs']} {of} whose reference takes over 0.3 s, at "
+                f"{row['tolerance']:g}: **{figures(row['speed_up'])} times** as fast in the median, "
+                f"{figures(row['later_speed_up'])} times without planning, which takes "
+                f"{row['planning_share']:.0%} of the reference's time; {figures(row['speed_up_least'])} times at "
+                "worst, of those over 0.1 s.",
+            ]
     if hard := content.get("hard_summary"):
         inside = ", ".join(f"{row['inside']} of {row['pairs']} at {row['tolerance']:g}" for row in hard)
         lines += [

@@ -47,5 +47,7 @@ def choose(query: Query, *, propagator: str | Propagator = "nonparaxial", method
         raise ValueError(f"{propagator} has no method {method!r}; known: {', '.join(row.method for row in rows)}.")
     if query.how.samples is not None:  # a number of samples asks for a grid that has one
         rows = [row for row in rows if row.on_grid] or rows
-    valid = [row for row in rows if row.valid_for(query) is None] or rows
-    return valid[0] if len(valid) == 1 else min(valid, key=lambda row: row.cost(query))
+    if len(rows) == 1:
+        return rows[0]
+    cheapest = sorted(rows, key=lambda row: row.cost(query))  # what is dear need not be asked whether it is valid
+    return next((row for row in cheapest if row.valid_for(query) is None), cheapest[0])
