@@ -1,4 +1,5 @@
-"""Values of before: each question of `golden.questions` still has the answer that commit 6be9aaf gave.
+"""Values of before: each question of `golden.questions` still has the answer that commit 6be9aaf gave;
+of plans since that are made from spectra, that of the commit which made them so.
 
 A tensor may be 1e-6 of its norm off in float32 and 1e-12 in float64, times the factor that `golden.rounding` gives.
 Where an answer is meant to change, ``PYTHONPATH=tests python -m golden.record`` records new ones of the questions whose
