@@ -31,6 +31,8 @@ ENDS = (ADC, *DEMOSAICING)
 
 SAFETY = 1.25
 """The sum of a plan's errors stays below the tolerance by this factor: what pricing each choice by itself misses."""
+UNTRIED = 1.5
+"""The same, of plans that no last trial has seen."""
 
 
 GROWTH = 4.0
@@ -166,7 +168,8 @@ class Plan:
     """What to simulate of a camera for a scene, as a value: print it, change it, save it, apply it.
 
     tolerance: as asked for; allowed: the number that it stands for.
-    bound: sum of the counted errors, or what the last trial found if that is more; at most allowed / `SAFETY`.
+    bound: sum of the counted errors, or what the last trial found if that is more; at most allowed / `SAFETY`, and
+    allowed / `UNTRIED` where there was none.
     expected: root of the sum of their squares. checked: what the last trial found; None if there was none.
     changes: arguments of the camera's Imaging. skipped: indices of the stages that are left out.
     stages: classes of the camera's, by which it is known again. gradients: whether they were held to the tolerance, and

@@ -18,7 +18,7 @@ from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, Decision, Plan, Range, noiseless_raw
+from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
@@ -45,11 +45,11 @@ def make_plan(
     """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
 
     A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
-    until the sum of all errors is below the tolerance / `SAFETY`. Where the raw is linear in the light, those follow
+    until the sum of all errors is below the tolerance / `UNTRIED`. Where the raw is linear in the light, those follow
     from spectra. Else (light beyond the full well, PSFs that vary over the picture, gradients, a batch with depth) they
-    are tried out, and the way goes on until a last trial fits: the whole plan against the reference, each item of each
-    batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them. The way up does not depend on
-    the tolerance: with a smaller one it goes further.
+    are tried out, and the way goes on until a last trial is below the tolerance / `SAFETY`: the whole plan against the
+    reference, each item of each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them.
+    The way up does not depend on the tolerance: with a smaller one it goes further.
 
     Args:      scenes: one or several, of the same wavelengths.
                tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this
@@ -140,7 +140,7 @@ class Planner:
         """
         counted = [skip for skip in skips if skip.counted]
         while True:
-            _climb(steps, counted, self.evaluator, allowed / SAFETY)
+            _climb(steps, counted, self.evaluator, allowed / (UNTRIED if self.evaluator.certain else SAFETY))
             if self.evaluator.certain:
                 return None
             ways: list[Any] = [*_relevant(steps), *counted]
