@@ -339,9 +339,9 @@ def margin_of(setup: Setup) -> int:
     return max(setup.window) // 2 + moved + 4
 
 
-def fidelity(picture: Tensor, crops: list[Crop]) -> dict[str, float]:
-    """PSNR over all crops, and in the worst [dB]."""
-    brightest = max(float(crop.light.max()) for crop in crops)
+def fidelity(picture: Tensor, crops: list[Crop], *, beside: list[Crop] | None = None) -> dict[str, float]:
+    """PSNR over all crops, and in the worst [dB], by the brightest of them, or of those beside which they stand."""
+    brightest = max(float(crop.light.max()) for crop in [*crops, *(beside or [])])
     squares = [float((crop.of(picture) - crop.light).double().square().mean()) for crop in crops]
 
     def decibels(square: float) -> float:
@@ -393,9 +393,9 @@ def methods(camera: str, sizes: Sizes, chosen: tuple[float, ...]) -> Rows:
                 dense = truth(setup, side=sizes.dense, at=CROPS[1], spacing=1)
                 own = truth(setup, side=sizes.dense, at=CROPS[1])
                 picture = setup.picture(setup.anew())
-                near = {"psnr": fidelity(own.light, [replace(dense, top=0, left=0)])["psnr"]}
+                near = {"psnr": fidelity(own.light, [replace(dense, top=0, left=0)], beside=crops)["psnr"]}
                 yield said | {"who": f"truth, PSFs {FINE} pixels apart, against one for each pixel"} | near
-                yield said | {"who": "kcam, against one PSF for each pixel"} | fidelity(picture, [dense])
+                yield said | {"who": "kcam, against one PSF for each pixel"} | fidelity(picture, [dense], beside=crops)
             picture, times = taken(setup)
             yield said | {"who": "kcam"} | times | fidelity(picture, crops) | estimated(setup)
             for who, kind in BASELINES.items():
