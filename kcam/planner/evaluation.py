@@ -109,11 +109,12 @@ class Evaluator:
 
     @property
     def certain(self) -> bool:
-        """Whether what choices cost is known without trying all of them together: of linear optics, and one scene where
-        things hide others.
+        """Whether what choices cost is known without trying all of them together: of linear optics, and of one scene, or
+        several at one distance: layers are shared by a batch, and what few of its items need was tried on some.
         """
-        deep = any(float(one.far.min()) < float(one.near.max()) for own in self.surveys for one in own)
-        return self.spectra is not None and not (deep and sum(map(len, self.surveys)) > 1)
+        each = [one for found in self.surveys for one in found]
+        apart = len(each) > 1 and min(float(one.far.min()) for one in each) < max(float(one.near.max()) for one in each)
+        return self.spectra is not None and not apart
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether all wavelengths may be compared at no cost."""
