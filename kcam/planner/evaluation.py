@@ -109,8 +109,8 @@ class Evaluator:
 
     @property
     def certain(self) -> bool:
-        """Whether what choices cost is known without trying all of them together: of linear optics, and of one scene, or
-        several at one distance: layers are shared by a batch, and what few of its items need was tried on some.
+        """Whether what choices cost is known without trying all of them together: of linear optics, and of one scene,
+        or several at one distance: layers are shared by a batch, and what few of its items need was tried on some.
         """
         each = [one for found in self.surveys for one in found]
         apart = len(each) > 1 and min(float(one.far.min()) for one in each) < max(float(one.near.max()) for one in each)
