@@ -108,11 +108,16 @@ class Evaluator:
             ]
 
     @property
+    def items(self) -> list[Survey]:
+        """Of every item of every scene, what was seen of it."""
+        return [one for found in self.surveys for one in found]
+
+    @property
     def certain(self) -> bool:
         """Whether what choices cost is known without trying all of them together: of linear optics, and of one scene,
         or several at one distance: layers are shared by a batch, and what few of its items need was tried on some.
         """
-        each = [one for found in self.surveys for one in found]
+        each = self.items
         apart = len(each) > 1 and min(float(one.far.min()) for one in each) < max(float(one.near.max()) for one in each)
         return self.spectra is not None and not apart
 
@@ -122,7 +127,7 @@ class Evaluator:
 
     def _is_linear(self) -> bool:
         """Whether the raw is, as far as these scenes go."""
-        if not linear(self.raw_camera) or any(bool(one.potential[BEYOND].any()) for own in self.surveys for one in own):
+        if not linear(self.raw_camera) or any(bool(one.potential[BEYOND].any()) for one in self.items):
             return False
         tiles = any(isinstance(stage, ColourFilter) and stage.is_tile for stage in self.raw_camera)
         # of filters that differ from pixel to pixel the survey knows the mean

@@ -119,7 +119,7 @@ class Planner:
             stages=tuple(type(stage).__name__ for stage in self.camera),
             range=Range.of(
                 self.scenes,
-                [one for found in self.evaluator.surveys for one in found],
+                self.evaluator.items,
                 self.evaluator.defocus,
                 varies=self.evaluator.varies,
             ),

@@ -156,12 +156,8 @@ class Spectra:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
         vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
         ends = torch.stack([vergences.min(), vergences.max()])
-        return self._inside(self.imaging, ends, self._window(self.imaging, ends))
-
-    def _inside(self, imaging: Imaging, vergences: Tensor, window: tuple[int, int]) -> bool:
-        query = self._query(imaging, vergences, self.scene.wavelengths, window)
-        room = (min(window) // 2 - _AROUND) * imaging.pixel_pitch
-        return query is None or float(query.displacement.max()) < room
+        query = self._query(self.imaging, ends, self.scene.wavelengths, self._window(self.imaging, ends))
+        return query is None or _inside(query)
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
         if not isinstance(lens := imaging.lens, Lens):
@@ -180,7 +176,7 @@ class Spectra:
             every = [self.imaging.changed(bands=count).psf_wavelengths(own) for count in counts]
             wavelengths = torch.cat(every).unique()
             found, query = None, self._query(imaging, vergences, wavelengths, window)
-            if query is not None and self._inside(imaging, vergences, window):
+            if query is not None and _inside(query):
                 found = imaging.accuracy.row(query).transfer(query, self.frequencies)
             known = None if found is None else found.cpu().to(torch.complex128)
             self._tables[key] = None if known is None else _Table(wavelengths.tolist(), known)
@@ -201,6 +197,11 @@ class Spectra:
         for dim, length in zip((-2, -1), window, strict=True):
             known = known.narrow(dim, known.shape[dim] // 2 - length // 2, length)
         return known
+
+
+def _inside(query: Query) -> bool:
+    """Whether all rays fall well inside the window."""
+    return float(query.displacement.max()) < (min(query.shape) // 2 - _AROUND) * query.pixel_pitch
 
 
 def even_counts(total: int) -> list[int]:

@@ -116,7 +116,7 @@ def test_the_projection_gives_what_the_table_of_j0_gives(rim: float, monkeypatch
     nodes, arguments = 64 + int(abs(rim)) * 2, 1024
     found = []
     for kept in (2**30, 0):
-        monkeypatch.setattr(batch, "_KEPT_TABLE", kept)
+        monkeypatch.setattr(batch, "KEPT", kept)
         defocus = torch.tensor([[rim]], dtype=torch.float64, requires_grad=True)
         amplitude = batch._amplitude(defocus, nodes=nodes, arguments=arguments)
         weight = torch.linspace(1, 2, arguments, dtype=torch.float64)

@@ -19,7 +19,7 @@ from kcam.optics.numerics import lagrange, legendre, phasor
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.intensity import pupil_intensity
 from kcam.optics.propagation.pixels import Pixels
-from kcam.optics.propagation.radial import hankel_kernel
+from kcam.optics.propagation.radial import KEPT, even_between, hankel_kernel
 from kcam.optics.propagation.transforms import MatrixTransform
 from kcam.optics.pupil.coordinates import Pupil, grid_nodes, grid_spacing
 from kcam.optics.pupil.quadrants import unfold
@@ -29,7 +29,6 @@ from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 _STEP = math.pi / 24  # of t in the table of J0: |U|^2 by cubic interpolation is then good to 1e-4 of its fringes
 _PROFILE_STEPS = 16  # of the profile for each of its fringes; cubic between them
 _TAPS = range(-1, 3)  # of a cubic
-_KEPT_TABLE = 2**22  # entries of a table of J0: 34 MB
 _MOST_FRINGES = 2**20
 
 
@@ -235,12 +234,7 @@ def _radial_bank(
     intensity = _amplitude(rim, nodes=nodes, arguments=arguments).square().sum(0)  # (B, L, Z, T)
     steps = torch.arange(math.ceil(corner * per_pixel) + 3, dtype=torch.float64, device=residual.device)
     position = scales[..., None] * (steps * (pixel_pitch / per_pixel / _STEP))  # (B, L, R)
-    low = torch.clamp(position.detach().floor().long(), max=arguments - 3)
-    offset = position - low
-    profile = torch.zeros(())
-    for tap, weight in zip(_TAPS, lagrange(offset, taps=_TAPS), strict=True):
-        index = (low + tap).abs()[:, :, None].expand(-1, -1, intensity.shape[2], -1)  # I is even in t
-        profile = profile + weight[:, :, None] * intensity.gather(-1, index)
+    profile = even_between(intensity, position)
     factor = math.pi * (a[:, None] * pixel_pitch / (grid.to(residual.device) * d[:, None])) ** 2
     profile = (profile * factor[..., None, None]).to(dtype)
     octant = torch.sparse.mm(_ring_shares(half, per_pixel, dtype, residual.device), profile.flatten(0, 2).T)
@@ -261,7 +255,7 @@ def _amplitude(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
 
     By Gauss-Legendre and a table of J0 that is kept, or, where that would be too large, through the projection.
     """
-    if nodes * arguments > _KEPT_TABLE:
+    if nodes * arguments > KEPT:
         return _projected(rim, nodes=nodes, arguments=arguments)
     rho, weights = (torch.as_tensor(value, device=rim.device) for value in legendre(nodes))
     rho = (rho + 1) / 2

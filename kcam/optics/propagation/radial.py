@@ -20,7 +20,9 @@ from kcam.optics.pupil.coordinates import Pupil, from_image_side
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
 _MOST_RINGS = 2**20
 _RINGS_AT_ONCE = 2**24  # entries of the Hankel table: 128 MB
-_KERNELS, _KEPT = ValueCache(8), 2**22  # the last tables, and entries of one that is kept: 34 MB
+KEPT = 2**22
+"""Entries of a table of J0 that is kept: 34 MB."""
+_KERNELS = ValueCache(8)  # the last tables
 _EVEN = 128  # steps by which tables grow, so that a lens that is focused anew finds its own
 _FEWEST, _PER_FRINGE = 256, 2  # frequencies in a table of transfer functions, in all and for each fringe
 _CUBIC = range(-1, 3)
@@ -106,13 +108,19 @@ def radial_transfer(query: Query, frequencies: Tensor) -> Tensor:
         pixel = torch.ones_like(pixel)
     radius = torch.sqrt(along**2 + across**2) / query.pixel_pitch  # (F, 3, 3)
     place = (wavelengths[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is nothing
-    low = place.detach().long().clamp(max=count - 3)
-    value = torch.zeros(())
-    for tap, weight in zip(_CUBIC, lagrange(place - low, taps=_CUBIC), strict=True):
-        index = (low + tap).abs()[:, None].expand(-1, table.shape[1], -1)  # even
-        value = value + weight[:, None] * table.gather(-1, index)
+    value = even_between(table, place)
     found = (value.unflatten(-1, radius.shape) * pixel).sum((-2, -1))
     return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
+
+
+def even_between(values: Tensor, position: Tensor) -> Tensor:
+    """An even function that is known at 0, 1, ..., (..., Z, T), at positions (..., R): (..., Z, R), by cubics."""
+    low = position.detach().floor().long().clamp(max=values.shape[-1] - _CUBIC.stop)
+    found = torch.zeros(())
+    for tap, weight in zip(_CUBIC, lagrange(position - low, taps=_CUBIC), strict=True):
+        index = (low + tap).abs().unsqueeze(-2).expand(*values.shape[:-1], -1)
+        found = found + weight.unsqueeze(-2) * values.gather(-1, index)
+    return found
 
 
 def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
@@ -126,7 +134,7 @@ def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
         return 2 * math.pi * BesselJ0.apply(t[:, None] * rho).T
 
     count = _EVEN * math.ceil(steps / _EVEN)
-    if rho.numel() * count > _KEPT:
+    if rho.numel() * count > KEPT:
         return build(steps)
     return _KERNELS.get((rho, count, step), lambda: build(count))[:, :steps]
 
