@@ -1,4 +1,6 @@
-"""PSFs at places of the sensor, computed once: places that mirror each other share theirs, and so do wavelengths."""
+"""PSFs that are computed once: of points on the axis for a planner; at places of the sensor, those that mirror each
+other share theirs, and so do wavelengths.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,52 @@ OUTSIDE = 5e-3
 KEPT = 2e8  # bytes of PSFs that are kept
 _HALVINGS = 30
 
+OnAxis = Callable[[Tensor, Tensor, PixelGrid], Tensor]
+"""PSFs (Z, L, h, w) of vergences (Z,), at wavelengths (L,), on pixels."""
+
 Compute = Callable[[Tensor, Tensor, PixelGrid, bool], Tensor]
 """PSFs (F, Z, L, h, w) of places (F, 2), at wavelengths (L,), on pixels, whole or not: see `source.FieldPSFs`."""
+
+
+class KnownPSFs:
+    """PSFs of points on the axis, each kept by itself: a smaller window has the middle of a larger one. For a planner,
+    which asks for the same ones again and again; up to `KEPT` bytes.
+
+    ends: wavelengths (2,) that are computed with those asked for, so that any part of a spectrum is computed alike.
+    """
+
+    def __init__(self, ends: Tensor) -> None:
+        self.ends = ends
+        self._known: dict[tuple[object, ...], Tensor] = {}
+        self._held = 0.0
+
+    def bank(self, how: object, vergences: Tensor, wavelengths: Tensor, pixels: PixelGrid, compute: OnAxis) -> Tensor:
+        """PSFs (Z, L, h, w); how: what else they depend on."""
+        how = how, replace(pixels, shape=(1, 1))
+        rows, columns = ([(how, value) for value in values.tolist()] for values in (vergences, wavelengths))
+        missing = torch.tensor([[not self._holds((row, column), pixels.shape) for column in columns] for row in rows])
+        if bool(missing.any()):
+            size = math.prod(missing.shape) * math.prod(pixels.shape) * pixels.dtype.itemsize
+            if self._held + size > KEPT:
+                return compute(vergences, wavelengths, pixels)
+            self._held += size
+            layers, colours = vergences[missing.any(1).to(vergences.device)], wavelengths[missing.any(0)]
+            asked = torch.cat([colours, self.ends.to(colours)]).unique()
+            for value, psfs in zip(layers.tolist(), compute(layers, asked, pixels), strict=True):
+                self._known |= {((how, value), (how, w)): psf for w, psf in zip(asked.tolist(), psfs, strict=True)}
+        return torch.stack(
+            [torch.stack([_middle(self._known[row, column], pixels.shape) for column in columns]) for row in rows]
+        )
+
+    def _holds(self, key: tuple[object, ...], shape: tuple[int, int]) -> bool:
+        known = self._known.get(key)
+        return known is not None and all(n >= m for n, m in zip(known.shape, shape, strict=True))
+
+
+def _middle(psf: Tensor, shape: tuple[int, int]) -> Tensor:
+    for dim, length in enumerate(shape):
+        psf = psf.narrow(dim, psf.shape[dim] // 2 - length // 2, length)
+    return psf
 
 
 @dataclass(frozen=True)

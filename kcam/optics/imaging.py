@@ -21,6 +21,7 @@ from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
 from kcam.optics.accuracy import OVER_THE_FIELD, Accuracy, Recipe, Shortcuts
+from kcam.optics.banks import KnownPSFs
 from kcam.optics.field import PROBE, PROBED, FieldEstimate, FieldPicture
 from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
@@ -121,6 +122,7 @@ class Imaging(Stage):
         self._traced_cache, self._field_cache = ValueCache(_TRACED), ValueCache()
         self._window_cache = ValueCache(_TRACED)
         self._reach: float | None = None  # from the axis, of the picture of which this is a part [m]
+        self._known: KnownPSFs | None = None  # while the lens stays as it is
         self._check_recipe()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -152,7 +154,7 @@ class Imaging(Stage):
         changed = Imaging(**(self.configuration() | arguments))
         changed._warns = self._warns and "layers" not in arguments
         changed._traced_cache, changed._window_cache = self._traced_cache, self._window_cache
-        changed._reach = self._reach
+        changed._reach, changed._known = self._reach, self._known
         if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
             changed._field_cache = self._field_cache
         return changed
@@ -160,7 +162,17 @@ class Imaging(Stage):
     def fresh(self) -> Imaging:
         """The same stage that has kept nothing, but for the pupils that were traced."""
         own = self.changed()
-        own._field_cache, own._window_cache = ValueCache(), ValueCache(_TRACED)
+        own._field_cache, own._window_cache, own._known = ValueCache(), ValueCache(_TRACED), None
+        return own
+
+    def knowing(self, wavelengths: Tensor) -> Imaging:
+        """The same stage, which keeps each PSF that it and those changed from it compute without gradients, for scenes
+        of these wavelengths: as long as the lens stays what it is, which is not asked.
+        """
+        own = self.changed()
+        if not self.varies and self._positions is None:
+            ends = torch.stack(wavelengths.aminmax()) if getattr(self.lens, "symmetric", False) else wavelengths[:0]
+            own._known = KnownPSFs(ends)
         return own
 
     def _check_recipe(self) -> None:
@@ -274,10 +286,18 @@ class Imaging(Stage):
         return PixelGrid(self.pixel_pitch, shape, self.fill_factor, self.integrate, like.dtype, like.device)
 
     def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
-        """PSFs (N, L, h, w) of source points by this stage's accuracy, computed anew."""
-        if isinstance(self.lens, Lens):
-            return self.lens.bank(points, wavelengths, pixels, self.accuracy)
-        return self.lens.bank(points, wavelengths, pixels)
+        """PSFs (N, L, h, w) of source points by this stage's accuracy, computed anew unless it is `knowing`."""
+
+        def compute(vergences: Tensor, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
+            own = replace(points, vergences=vergences)
+            if isinstance(self.lens, Lens):
+                return self.lens.bank(own, wavelengths, pixels, self.accuracy)
+            return self.lens.bank(own, wavelengths, pixels)
+
+        if self._known is None or torch.is_grad_enabled():
+            return compute(points.vergences, wavelengths, pixels)
+        how = tuple(getattr(self.accuracy, field.name) for field in fields(Recipe))
+        return self._known.bank(how, points.vergences, wavelengths, pixels, compute)
 
     def computed_lens(self, *, by: str) -> Lens:
         """The lens, for what asks it more than PSFs. Raises: ValueError, which says `by` whom, where there is none."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,7 +37,7 @@ from kcam.planner.plan import (
     with_imaging,
 )
 from kcam.planner.spectra import LINEAR, Spectra, linear
-from kcam.planner.survey import BEYOND, KINDS, TILE, Survey, survey
+from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter
 from kcam.sensor.noise import RandomStage
@@ -86,7 +86,9 @@ class Evaluator:
     """
 
     def __init__(self, camera: Camera, scenes: Sequence[Scene]) -> None:
-        self.camera, self.raw_camera = camera, noiseless_raw(camera)
+        self.camera, raw = camera, noiseless_raw(camera)
+        known = (stage.knowing(scenes[0].wavelengths) if isinstance(stage, Imaging) else stage for stage in raw)
+        self.raw_camera = Camera(*known, context=raw.context)  # whose PSFs are computed once
         stages: list[Any] = list(self.raw_camera)
         self.index = next((i for i, stage in enumerate(stages) if isinstance(stage, Imaging)), None)
         self.imaging: Imaging | None = None if self.index is None else stages[self.index]
@@ -101,11 +103,38 @@ class Evaluator:
         self.witnesses = _samples(full, self.surveys, pixels=WITNESSED)
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
         self.scenes = full
+        self.signals: list[dict[int, tuple[Tensor, Context]]] = []
         self.spectra: list[Spectra] | None = None
-        if self.imaging is not None and not self.gradients and not self.varies and self._is_linear():
+
+    def look(self, settings: Mapping[str, Any]) -> None:
+        """See what the stages of the sensor are given, with about these optics, and whether spectra tell what choices
+        cost: where the raw is linear in the light, but for what the full well cuts off.
+        """
+        few = {**settings, "bands": 1}
+        if "layers" in few and not any(bool(one.potential[BEYOND].any()) for one in self.items):
+            few["layers"] = 1
+        self.signals = self._signals(few)
+        if self.imaging is not None and not self.gradients and not self.varies and linear(self.raw_camera):
             self.spectra = [
                 Spectra(self.raw_camera, self.imaging, sample.scene, picture=sample.picture) for sample in self.samples
             ]
+
+    @property
+    def _signals_by_owner(self) -> Iterator[tuple[int, dict[int, tuple[Tensor, Context]]]]:
+        owners = (owner for sample in self.samples for owner in sample.owners)
+        return zip(owners, self.signals, strict=True)
+
+    @functools.cached_property
+    def lost(self) -> dict[int, float]:
+        """RMS of the light of each whole over that of what the full well leaves of it."""
+        energies: dict[int, list[float]] = {}
+        for owner, given in self._signals_by_owner:
+            clips = [index for index, stage in enumerate(self.camera) if isinstance(stage, CLIPPING)]
+            signal = given[min(clips)][0].detach() if clips and min(clips) in given else torch.ones(1)
+            whole = energies.setdefault(owner, [0.0, 0.0])
+            for index, light in enumerate((signal, signal.clamp(max=1))):
+                whole[index] += float(light.square().sum(dtype=torch.float64))
+        return {owner: math.sqrt(one / other) if other else 1.0 for owner, (one, other) in energies.items()}
 
     @property
     def items(self) -> list[Survey]:
@@ -114,36 +143,27 @@ class Evaluator:
 
     @property
     def certain(self) -> bool:
-        """Whether what choices cost is known without trying all of them together: of linear optics, and of one scene,
-        or several at one distance: layers are shared by a batch, and what few of its items need was tried on some.
-        """
-        each = self.items
-        apart = len(each) > 1 and min(float(one.far.min()) for one in each) < max(float(one.near.max()) for one in each)
-        return self.spectra is not None and not apart
+        """Whether what choices cost is known without trying all of them together."""
+        return self.spectra is not None
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether all wavelengths may be compared at no cost."""
         return self.spectra is not None and all(spectra.tabled(settings) for spectra in self.spectra)
 
-    def _is_linear(self) -> bool:
-        """Whether the raw is, as far as these scenes go."""
-        if not linear(self.raw_camera) or any(bool(one.potential[BEYOND].any()) for one in self.items):
-            return False
-        tiles = any(isinstance(stage, ColourFilter) and stage.is_tile for stage in self.raw_camera)
-        # of filters that differ from pixel to pixel the survey knows the mean
-        return not tiles or all(float(one.raw.max()) < 1 for one in self.answers({"blur": False}) if one.raw.numel())
-
     def error(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes."""
-        known = (changes.keys() | against.keys()) <= LINEAR and changes.get("layers") == against.get("layers")
-        if self.spectra is None or not known:
+        """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes.
+
+        By spectra light beyond the full well counts too, so that they say at least as much.
+        """
+        if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
             return _error(self.samples, self.answers(changes), self.answers(against))
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
             energies = torch.stack(spectra.energies(changes, against))
             for rows, factor in sample.of_owners():
                 off, all_of_it = energies[:, rows].sum(1).tolist()
-                found.append(factor * math.sqrt(off / all_of_it) if all_of_it else 0.0)
+                lost = self.lost[sample.owners[rows[0]]]
+                found.append(factor * lost * math.sqrt(off / all_of_it) if all_of_it else 0.0)
         return max(found)
 
     def last(self, changes: Mapping[str, Any], skipped: Sequence[int]) -> float:
@@ -223,7 +243,7 @@ class Evaluator:
                 break
         return found
 
-    def signals(self, settings: Mapping[str, Any]) -> list[dict[int, tuple[Tensor, Context]]]:
+    def _signals(self, settings: Mapping[str, Any]) -> list[dict[int, tuple[Tensor, Context]]]:
         """For each row of the samples: what every stage up to the ADC is given, without noise, with these optics."""
         result = []
         with torch.no_grad():
@@ -241,14 +261,14 @@ class Evaluator:
                 ]
         return result
 
-    def noise(self, signals: Sequence[Mapping[int, tuple[Tensor, Context]]]) -> float:
+    def noise(self) -> float:
         """Sigma of all noise and half a step of the ADC, relative to the raw's RMS: of the scene that has least."""
         found: dict[int, list[float]] = {}
         for index, stage in enumerate(self.camera):
             share = 3 if isinstance(stage, ADC) else 1  # half a step is sqrt(3) of its sigma
             if isinstance(stage, (RandomStage, ADC)):
                 energies: dict[int, list[float]] = {}
-                for owner, given in zip((o for sample in self.samples for o in sample.owners), signals, strict=True):
+                for owner, given in self._signals_by_owner:
                     energy = float(given[index][0].detach().double().square().sum())
                     part = energies.setdefault(owner, [0.0, 0.0])
                     part[0] += share * energy * stage.error_if_skipped(*given[index]) ** 2

@@ -17,7 +17,7 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
 from kcam.planner.evaluation import CROP, Evaluator
-from kcam.planner.spectra import FEW_BANDS, even_counts
+from kcam.planner.spectra import FEW_BANDS, WINDOWS, even_counts
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -30,7 +30,6 @@ URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
 
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
-WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
 
@@ -147,11 +146,15 @@ class Ladder:
 
 
 def ladders(evaluator: Evaluator, scene: Scene) -> list[Ladder]:
-    """The choices that exist for a camera and a scene (the one that takes longest)."""
+    """The choices that exist for a camera and a scene (the one that takes longest), of which the evaluator has then
+    seen what it needs.
+    """
     imaging = evaluator.imaging
     if imaging is None:
+        evaluator.look({})
         return []
     view = _View(evaluator, imaging, scene)
+    evaluator.look(view.beside)
     return [ladder for make in LADDERS for ladder in make(view)]
 
 
@@ -204,6 +207,7 @@ class _View:
         if layers and self.layers > FEW_LAYERS:
             few["layers"] = FEW_LAYERS
         core = 2 * (math.ceil(self.blur / self.imaging.pixel_pitch) + TAIL) + 1
+        core = min((side for side in WINDOWS if side >= core), default=core)
         if window and core < 0.75 * max(self.window):
             few["psf_shape"] = (min(core, self.window[0]), min(core, self.window[1]))
         if self.apart is not None:  # the middle, the sides and the corners
@@ -272,11 +276,12 @@ def _depth(view: _View) -> Iterator[Ladder]:
     names = {1: "one plane"}
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in LAYERS if n < view.layers]
     top = Level(f"{view.layers} layers", {}, view.layers)
-    layers = Ladder("depth", [*levels, top], view.few(layers=False), successive=True)
+    beside = view.few(layers=False)
+    layers = Ladder("depth", [*levels, top], beside, successive=True)
     yield layers
     if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
-        yield Ladder("occlusion", levels, view.few(layers=False), follows=layers)
+        yield Ladder("occlusion", levels, beside, follows=layers)
 
 
 def _support(view: _View) -> Iterator[Ladder]:

@@ -77,7 +77,7 @@ class Planner:
         always = {} if max_memory is None else {"max_memory": float(max_memory)}
         self.prices = _Prices(camera, self.evaluator, self.scenes, always)
         self._checked: dict[tuple[Any, ...], float] = {}
-        self._known: tuple[list[Ladder], list[_Skip], Signals] | None = None
+        self._known: tuple[list[Ladder], list[_Skip]] | None = None
         self._setup = time.perf_counter() - start
 
     def plan(self, tolerance: float | str) -> Plan:
@@ -88,8 +88,8 @@ class Planner:
         skipped: list[int] = []
         allowed, checked = 0.0, None
         if tolerance != 0 and self.evaluator.samples:
-            ladders, skips, signals = self._ways()
-            noise = self.evaluator.noise(signals)
+            ladders, skips = self._ways()
+            noise = self.evaluator.noise()
             allowed = noise if isinstance(tolerance, str) else float(tolerance)
             if allowed == 0:  # a sensor without noise or steps records everything
                 ladders, skips = [], []
@@ -103,7 +103,7 @@ class Planner:
             rows.add_way()
             for skip in skips:
                 rows.add_skip(skip, left_out=skip.index in skipped)
-            rows.add_saturation(self.camera, signals)
+            rows.add_saturation(self.camera, self.evaluator.signals)
         rows.add_memory()
         errors = [row.error for row in rows.decisions if row.counted]
         reference = self.prices.of({})
@@ -156,14 +156,13 @@ class Planner:
                 return self._checked[key]
             max(below, key=_urgency).climb(self.evaluator)
 
-    def _ways(self) -> tuple[list[Ladder], list[_Skip], Signals]:
-        """All choices, and what the stages of the sensor are given."""
+    def _ways(self) -> tuple[list[Ladder], list[_Skip]]:
+        """All choices."""
         if self._known is None:
             every = ladders(self.evaluator, self.prices.scene)
             steps = [ladder for ladder in every if ladder.always or self.prices.saves(ladder)]
-            signals = self.evaluator.signals(dict(steps[0].beside) if steps else {})
-            skips = [_Skip(self.camera, index, signals) for index in self.evaluator.skippable()]
-            self._known = steps, skips, signals
+            skips = [_Skip(self.camera, index, self.evaluator.signals) for index in self.evaluator.skippable()]
+            self._known = steps, skips
         return self._known
 
 

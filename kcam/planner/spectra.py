@@ -1,11 +1,11 @@
 """What a linear choice changes in the noiseless raw, from spectra: no picture is rendered for it.
 
-    E^2 = sum_f tr(A D(f) C(f) D(f)^H),   D_ck = sum_l kappa_cl S_kl (H_l - G_l)
+    E^2 = sum_f tr(D(f) C(f) D(f)^H),   D_rk = sum_l A_rl S_kl (H_l - G_l)
 
 C are the cross-spectra of a scene's planes, mirrored at its borders (a cosine transform), in rings of frequency; H and
-G are transfer functions, of which slices through the middle suffice: light that runs more along x sees that along x. A
-says how much of each pair of channels a pixel records. With layers of depth each plane is split among them, without
-occlusion, and each layer has transfer functions of its own.
+G are transfer functions, of which slices through the middle suffice: light that runs more along x sees that along x.
+A^T A is what pixels record of each pair of bands, in their mean. With layers of depth each plane is split among them,
+without occlusion, and each layer has transfer functions of its own; where there are fewer, those of its neighbours.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -24,7 +24,8 @@ from kcam.camera import Camera
 from kcam.isp import Clip
 from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.question import Query
-from kcam.optics.rendering.depth import alike
+from kcam.optics.propagation.row import Transfer
+from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.source import Points
 from kcam.scene import Scene
@@ -32,14 +33,17 @@ from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, 
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import Mean
 
-LINEAR = {"blur", "bands", "psf_shape", "renormalise", "kappa", "propagator", "layers"}
-"""Changes of an Imaging that act as transfer functions do."""
+LINEAR = {"blur", "bands", "psf_shape", "renormalise", "kappa", "propagator", "layers", "occlusion"}
+"""Changes of an Imaging that act as transfer functions do, and that of what hides what."""
 
-_OF_PSFS = ("psf_shape", "renormalise", "kappa")  # what changes PSFs, and no transfer function of the optics
+WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
+"""Sides of the windows of PSFs that may stand for the whole [pixels]."""
 
 _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
+_UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
+_WHOLE = 1e-4  # of a scene's light, that planes of fewer spectra may leave out
 FEW_BANDS = 3
 """Wavelengths of the settings beside which a choice is priced."""
 
@@ -57,49 +61,76 @@ class _Layered:
 
 
 class _Table(NamedTuple):
-    """Wavelengths, and transfer functions (Z, L, 2, F)."""
+    """Wavelengths, and their transfer functions."""
 
     wavelengths: list[float]
-    transfer: Tensor
+    transfer: Transfer
 
 
 class Spectra:
     """A batch of scenes before a camera, as spectra; picture: (H, W) of the wholes that they are part of."""
 
     def __init__(self, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int]) -> None:
-        self.imaging, self.scene, self.picture = imaging, scene, picture
-        self.weights, self.pairs = _recorded(camera, scene)
+        self.imaging, self.scene, self.picture = imaging, _compressed(scene), picture
+        self.weights = _recorded(camera, scene)
         self.frequencies = _rings()
-        self.groups = [(rows, scene.samples(rows.tolist())) for rows in alike(scene)]
+        self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
-        self._banks: dict[Any, Tensor] = {}
         self._tables: dict[Any, _Table | None] = {}
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
         imaging = self.imaging.changed(**settings)
         vergences = [self._of(index, settings.get("layers")).vergences for index in range(len(self.groups))]
-        return all(self._table(imaging, own, self._window(imaging, own)) is not None for own in vergences)
+        return all(self._table(imaging, own, self._few) is not None for own in vergences)
+
+    @functools.cached_property
+    def _few(self) -> Tensor:
+        return self.imaging.changed(bands=FEW_BANDS).psf_wavelengths(self.scene.wavelengths)
+
+    @functools.cached_property
+    def _every(self) -> Tensor:
+        """All wavelengths at which PSFs may stand for those of others."""
+        own = self.scene.wavelengths
+        groups = (self.imaging.changed(bands=n).psf_wavelengths(own) for n in (None, FEW_BANDS, *even_counts(len(own))))
+        return torch.cat([*groups, self.imaging.psf_wavelengths(own)]).unique()
 
     def energies(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """For each row: the energy of the difference that changes make, and that of what it is against, (B,)."""
-        seen = any(changes.get(name) != against.get(name) for name in _OF_PSFS)
+        """For each row: the energy of the difference that changes make, and that of what it is against, (B,); of
+        different layers, where that has the finer ones.
+        """
+        if changes.get("occlusion") != against.get("occlusion"):
+            return self._hiding(changes, against)
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
-            theirs, ours = (self._once(index, layered, own, psfs=seen) for own in (against, changes))
+            theirs, ours = (self._once(index, layered, own, against) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
             hidden = len(layered.vergences) > 1 and self.imaging.accuracy.occlusion
             found[0, rows] *= (_HIDDEN if hidden else 1.0) ** 2
         return found[0] * (1.0 if self.fits else _CUT) ** 2, found[1]
 
+    def _hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+        """The same, tried out on grey light of a few wavelengths: what hides what has no colour, but lenses have."""
+        scene, few = self.scene, self._few
+        spectra = torch.eye(len(scene.wavelengths)) if scene.spectra is None else scene.spectra
+        weights = torch.ones(1, len(scene.wavelengths)) if self.weights is None else self.weights.abs()
+        shares = weights.sum(0).to(spectra) @ spectra.T
+        grey = torch.einsum("k,bkhw->bhw", shares.to(scene.coefficients), scene.coefficients)[:, None]
+        even = torch.ones(1, len(few)).to(spectra)
+        seen = replace(scene, coefficients=grey, spectra=even, wavelengths=few, illuminant=even[0])
+        ours, theirs = (
+            self.imaging.changed(**{**own, "bands": None})(seen).double().cpu() for own in (changes, against)
+        )
+        return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
+
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
-        """Of transfer functions (C, K Z, 2, F), recorded, (B,)."""
-        at_once = mixed.permute(2, 3, 0, 1)  # (2, F, C, K Z)
-        half = at_once.mH @ self.pairs.to(mixed.dtype) @ at_once
-        return torch.einsum("ofkj,bofjk->b", half, layered.crossed.to(mixed.dtype)).real.clamp(min=0)
+        """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
+        at_once = mixed.permute(2, 3, 0, 1)  # (2, F, R, K Z)
+        through = at_once @ layered.crossed.to(mixed.dtype)
+        return (through * at_once.conj()).real.sum((1, 2, 3, 4)).clamp(min=0)
 
     def _of(self, index: int, layers: Any) -> _Layered:
         key = index, str(layers)
@@ -113,40 +144,64 @@ class Spectra:
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
 
-    def _once(self, index: int, layered: _Layered, changes: Mapping[str, Any], *, psfs: bool) -> Tensor:
-        key = index, psfs, *sorted(changes.items())
+    def _once(self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any]) -> Tensor:
+        key = index, str(against.get("layers")), *sorted(changes.items())
         if key not in self._known:
-            self._known[key] = self._mixed(layered, changes, psfs=psfs)
+            between = None
+            if changes.get("layers") != against.get("layers"):
+                between = self._between(self.groups[index][1], layered.vergences, self.imaging.changed(**changes))
+            self._known[key] = self._mixed(layered, changes, between)
         return self._known[key]
 
-    def _mixed(self, layered: _Layered, changes: Mapping[str, Any], *, psfs: bool) -> Tensor:
-        """Of each channel for each plane in each layer, (C, K Z, 2, F); psfs: as PSFs of its window have them."""
+    def _between(self, scene: Scene, vergences: Tensor, imaging: Imaging) -> tuple[Tensor, Tensor]:
+        """Vergences (Y,) of the layers of a stage, and what each of others, (Z,), takes from these, (Z, Y)."""
+        own = imaging.vergences(scene, torch.as_tensor(scene.depth, dtype=torch.float64)).cpu()
+        if len(own) == 1:
+            return own, torch.ones(len(vergences), 1, dtype=torch.float64)
+        shares = layer_shares(vergences.cpu()[None, None, None], own, interpolate=imaging.accuracy.interpolate)[0, :, 0]
+        present = shares.amax(1) > 0
+        return own[present], shares[present].T
+
+    def _mixed(self, layered: _Layered, changes: Mapping[str, Any], between: tuple[Tensor, Tensor] | None) -> Tensor:
+        """Of each sum of bands for each plane in each layer, (R, K Z, 2, F).
+
+        between: what `_between` says of the layers of these changes, if they are others.
+        """
         imaging, scene = self.imaging.changed(**changes), self.scene
         groups = imaging.psf_wavelengths(scene.wavelengths)
-        transfer = self._transfer(imaging, layered.vergences, groups, psfs=psfs)  # (Z, G, 2, F)
+        vergences = layered.vergences if between is None else between[0]
+        transfer = self._transfer(imaging, vergences, groups)  # (Z, G, 2, F)
+        if between is not None:
+            transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
         owner = imaging.groups(scene.wavelengths)
         shaped = torch.empty(1, transfer.shape[1], 1, 1, dtype=torch.float64)
         mixing = Renderer(shaped, spectra=spectra, weights=self.weights, picture=(1, 1), owner=owner).mixing()
-        return torch.einsum("ckg,zgof->ckzof", mixing.to(transfer.dtype), transfer).flatten(1, 2)
+        mixed = mixing.flatten(0, 1).to(transfer.dtype) @ transfer.flatten(2).transpose(0, 1).flatten(1)
+        mixed = mixed.view(len(mixing), -1, len(transfer), 2, len(self.frequencies))
+        return mixed.flatten(1, 2)
 
-    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, psfs: bool) -> Tensor:
+    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Tensor:
         """Slices of transfer functions along x and y, (Z, G, 2, F)."""
         if not imaging.accuracy.blur:
-            return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.complex128)
+            return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
         window = self._window(imaging, vergences)
-        if not psfs and (known := self._table(imaging, vergences, window)) is not None:
+        if (known := self._table(imaging, vergences, wavelengths)) is not None:
             places = [known.wavelengths.index(one) for one in wavelengths.tolist()]
-            return known.transfer[:, places]
-        bank = self._bank(imaging, vergences, wavelengths, window)
-        sums = bank.sum((-2, -1), dtype=torch.float64).cpu()
+            found = known.transfer(self.frequencies, window).cpu()[:, places]
+        else:
+            found = self._slices(imaging, vergences, wavelengths, window)
+        return found / found[..., :1] if imaging.accuracy.renormalise else found
+
+    def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
+        pixels = imaging.pixels(window, imaging.working(self.scene)[:, :0])
+        bank = imaging.bank(Points(vergences), wavelengths, pixels)
         slices = []
         for dim in (-2, -1):
             along = bank.sum(dim, dtype=torch.float64).cpu()
             x = torch.arange(along.shape[-1], dtype=torch.float64) - along.shape[-1] // 2
             slices.append(along.to(torch.complex128) @ torch.exp(-2j * math.pi * x[:, None] * self.frequencies))
-        found = torch.stack(slices, dim=2)
-        return found / sums[..., None, None] if imaging.accuracy.renormalise else found
+        return torch.stack(slices, dim=2)
 
     def _window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
         return imaging.psf_window(self.scene.wavelengths, vergences=vergences, picture=self.picture)
@@ -165,38 +220,33 @@ class Spectra:
         pixels = imaging.pixels(window, torch.empty(0, dtype=torch.float64))
         return lens.question(Points(vergences), wavelengths, pixels, imaging.accuracy)
 
-    def _table(self, imaging: Imaging, vergences: Tensor, window: tuple[int, int]) -> _Table | None:
-        """Transfer functions of all wavelengths for which PSFs may stand, where optics know them without PSFs, and the
-        window cuts nothing but diffraction off.
+    def _table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
+        """Transfer functions of these wavelengths and others, where optics know them without PSFs.
+
+        A few wavelengths have a table, and all for which PSFs may stand another.
         """
-        key = (imaging.accuracy.propagator, imaging.accuracy.kappa, tuple(vergences.tolist()), window)
+        some = self._few if set(wavelengths.tolist()) <= set(self._few.tolist()) else self._every
+        if not set(wavelengths.tolist()) <= set(some.tolist()):
+            some = wavelengths
+        key = imaging.accuracy.propagator, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
-            own = self.scene.wavelengths
-            counts = {imaging.accuracy.bands, *even_counts(len(own)), FEW_BANDS, None}
-            every = [self.imaging.changed(bands=count).psf_wavelengths(own) for count in counts]
-            wavelengths = torch.cat(every).unique()
-            found, query = None, self._query(imaging, vergences, wavelengths, window)
-            if query is not None and _inside(query):
-                found = imaging.accuracy.row(query).transfer(query, self.frequencies)
-            known = None if found is None else found.cpu().to(torch.complex128)
-            self._tables[key] = None if known is None else _Table(wavelengths.tolist(), known)
+            query = self._query(imaging, vergences, some, self._window(self.imaging, vergences))  # none is larger
+            transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
+            self._tables[key] = None if transfer is None else _Table(some.tolist(), transfer)
         return self._tables[key]
 
-    def _bank(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
-        """PSFs (Z, G, h, w); those of a smaller window than was asked for before are the middle of what is known."""
-        recipe = imaging.accuracy
-        key = (recipe.propagator, recipe.kappa, tuple(vergences.tolist()), tuple(wavelengths.tolist()))
-        known = self._banks.get(key)
-        if known is None or any(n < m for n, m in zip(known.shape[-2:], window, strict=True)):
-            pixels = imaging.pixels(window, imaging.working(self.scene)[:, :0])
-            asked = wavelengths
-            if isinstance(imaging.lens, Lens) and imaging.lens.symmetric:  # with its ends any part finds the same rings
-                asked = torch.cat([wavelengths, torch.stack(self.scene.wavelengths.aminmax())])
-            found = imaging.bank(Points(vergences), asked, pixels)
-            known = self._banks[key] = found[:, : len(wavelengths)]
-        for dim, length in zip((-2, -1), window, strict=True):
-            known = known.narrow(dim, known.shape[dim] // 2 - length // 2, length)
-        return known
+
+def _compressed(scene: Scene) -> Scene:
+    """The scene as planes of the fewest spectra that leave out `_WHOLE` of its light at most."""
+    if scene.spectra is not None:
+        return scene
+    planes = scene.coefficients.detach()
+    flat = planes.transpose(0, 1).flatten(1)
+    energies, directions = torch.linalg.eigh((flat @ flat.T).double())
+    left_out = energies.clamp(min=0).cumsum(0)
+    least = int((left_out[:-1] <= _WHOLE**2 * left_out[-1]).sum())
+    onto = directions[:, least:].to(planes)
+    return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, onto), spectra=onto.T)
 
 
 def _inside(query: Query) -> bool:
@@ -226,9 +276,9 @@ def linear(camera: Camera) -> bool:
     return one and all(isinstance(stage, known) for stage in stages)
 
 
-def _recorded(camera: Camera, scene: Scene) -> tuple[Tensor | None, Tensor]:
-    """Weights (C, L) of a filter's channels, or None; and the mean over pixels of what each records of two, (C, C)."""
-    weights, pairs = None, torch.eye(len(scene.wavelengths), dtype=torch.float64)
+def _recorded(camera: Camera, scene: Scene) -> Tensor | None:
+    """Sums over the bands (R, L) whose squares add up to what a pixel records, in the mean over pixels; None: bands."""
+    weights, pairs = None, None
     for stage in camera:
         if isinstance(stage, ColourFilter):
             weights = stage.contraction(scene.wavelengths).detach().double().cpu()
@@ -237,8 +287,15 @@ def _recorded(camera: Camera, scene: Scene) -> tuple[Tensor | None, Tensor]:
                 alpha = stage.alpha().detach().double().cpu().flatten(0, 1)
                 pairs = alpha.T @ alpha / len(alpha)
         elif isinstance(stage, Mosaic):
-            pairs = pattern_tile(stage.pattern).flatten().bincount(minlength=len(pairs)).double().diag()
-    return weights, pairs
+            tile = pattern_tile(stage.pattern).flatten()
+            count = len(scene.wavelengths) if weights is None else len(weights)
+            pairs = tile.bincount(minlength=count).double().diag()
+    if pairs is None:
+        return None
+    sizes, sums = torch.linalg.eigh(pairs)
+    seen = sizes > _UNSEEN * sizes[-1]
+    sums = (sums[:, seen] * sizes[seen].sqrt()).T
+    return sums if weights is None else sums @ weights
 
 
 def _rings() -> Tensor:
@@ -250,7 +307,7 @@ def _rings() -> Tensor:
 
 def _crossed(planes: Tensor, frequencies: Tensor) -> Tensor:
     """Cross-spectra of planes (K, H, W), mirrored at the borders: (2, F, K, K) of light that runs along x, and y."""
-    spectrum = torch.as_tensor(dctn(planes.cpu().double().numpy(), axes=(-2, -1), norm="ortho"))
+    spectrum = torch.as_tensor(dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))
     fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in planes.shape[-2:])
     radius = torch.hypot(fy[:, None], fx)
     ring = torch.bucketize(radius.flatten(), (frequencies[1:] + frequencies[:-1]) / 2)
@@ -258,4 +315,4 @@ def _crossed(planes: Tensor, frequencies: Tensor) -> Tensor:
     order = label.argsort(stable=True)
     counts = label.bincount(minlength=2 * len(frequencies)).tolist()
     parts = spectrum.flatten(1)[:, order].split(counts, dim=1)
-    return torch.stack([part @ part.T for part in parts]).unflatten(0, (2, -1))
+    return torch.stack([part @ part.T for part in parts]).double().unflatten(0, (2, -1))

@@ -45,6 +45,9 @@ KINDS = (
 OF_DEPTH, NEIGHBOURS, BEYOND = KINDS[2:5], 5, 6
 """The kinds that nothing but depth makes hurt; the contrast between neighbours; and what the full well cuts off."""
 
+CLIPPING = (ShotNoise, DarkCurrent, Clip)
+"""Stages that stop at the full well."""
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -131,7 +134,7 @@ def _recording(camera: Camera, scene: Scene) -> tuple[Tensor, bool]:
                 weights = own.alpha().detach().double().cpu().mean((0, 1))[None] @ weights
         elif isinstance(own, Exposure):
             weights = weights * float(own.factor(camera.resolve(scene)).detach())
-        clips = clips or isinstance(own, (ShotNoise, DarkCurrent, Clip))
+        clips = clips or isinstance(own, CLIPPING)
     return weights, clips
 
 

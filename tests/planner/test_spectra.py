@@ -25,25 +25,36 @@ CHANGES = [
     ({"bands": 2, "psf_shape": (9, 9)}, {"bands": 2}),
     ({"bands": 2, "psf_shape": (33, 17), "renormalise": True}, {"bands": 2}),
 ]
+OF_DEPTH = [
+    ({"bands": 2, "layers": 1}, {"bands": 2, "layers": 2}),
+    ({"bands": 2, "layers": 2}, {"bands": 2, "layers": 3}),
+    ({"bands": 2, "layers": 3, "occlusion": False}, {"bands": 2, "layers": 3}),
+]
 
 
 @pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 40))])
 def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
-    """Cameras and scenes of benchmarks/planner.py: at one distance to a third, but where a window as large as the
-    picture is smaller than the blur; with depth, where things hide others, not much too small.
+    """Cameras and scenes of benchmarks/planner.py: at one distance to a third (beside points a PSF is not its slices),
+    but where a window as large as the picture is smaller than the blur; with depth, where things hide others, or beyond
+    the full well, not much too small.
     """
     camera, scene, text, _ = random_pair(seed, longest=1.0)
     with torch.no_grad():
         evaluator = Evaluator(camera, [scene])
-        if evaluator.spectra is None:
-            pytest.skip("some of its light is beyond the full well: then pictures are tried")
+        evaluator.look({"bands": 3})
+        assert evaluator.spectra is not None
         flat, fits = not isinstance(scene.depth, torch.Tensor), all(spectra.fits for spectra in evaluator.spectra)
-        for ours, theirs in CHANGES:
+        seen = max(evaluator.lost.values()) < 1.01
+        for ours, theirs in CHANGES if flat else CHANGES + OF_DEPTH:
             trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers(theirs))
             ratio = evaluator.error(ours, theirs) / max(trial, 1e-30)
             if 1e-3 < trial < 1:
-                low, high = (0.7, 1.3) if flat and fits else (0.6, 2.0) if flat else (0.6, 6.0)
-                assert low < ratio < high, f"{text}: {ours} against {theirs}, {ratio:.3g} times {trial:.3g}"
+                low, high = (
+                    (0.7 if "points" not in text else 0.6, 1.3) if flat and fits else (0.6, 2.0) if flat else (0.6, 6.0)
+                )
+                assert low < ratio < (high if seen else 1000), (
+                    f"{text}: {ours} against {theirs}, {ratio:.3g} x {trial:.3g}"
+                )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -59,7 +70,7 @@ def test_transfer_functions_are_those_of_the_psf(seed: int) -> None:
     row = RADIAL if draw.one_of(True, False) else RADIAL.in_fresnel_range()
     query = lens.question(Points(vergences), wavelengths, pixels)
     frequencies = torch.linspace(0.05, math.sqrt(0.5), 60, dtype=torch.float64)
-    found, psfs = row.transfer(query, frequencies), row(query)
+    found, psfs = row.transfer(query)(frequencies, (129, 129)), row(query)
     x = torch.arange(129, dtype=torch.float64) - 64
     expected = psfs.sum(-2) @ torch.cos(2 * math.pi * x[:, None] * frequencies)
     assert found.shape == (2, 4, 2, 60)

@@ -49,7 +49,13 @@ def samples_by_rule(query: Query, index: int) -> int:
 
 def sample_counts(query: Query) -> list[int]:
     """Pupil samples for each wavelength, as given or by the rule, also where so many would be refused."""
-    return [query.how.samples or samples_by_rule(query, index) for index in range(len(query.wavelengths))]
+    key = f"samples, {query.paraxial}"
+    if key not in query.kept:
+        query.kept[key] = [
+            query.how.samples or samples_by_rule(query, index) for index in range(len(query.wavelengths))
+        ]
+    found: list[int] = query.kept[key]
+    return found
 
 
 def _geometry(query: Query, index: int) -> dict[str, float]:

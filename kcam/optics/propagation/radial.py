@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -25,6 +26,8 @@ KEPT = 2**22
 _KERNELS = ValueCache(8)  # the last tables
 _EVEN = 128  # steps by which tables grow, so that a lens that is focused anew finds its own
 _FEWEST, _PER_FRINGE = 256, 2  # frequencies in a table of transfer functions, in all and for each fringe
+_BEYOND_RAYS = 80.0  # times what the rim diffracts beyond all, for transfer functions
+_TAIL = 64  # rings of what it diffracts farther
 _CUBIC = range(-1, 3)
 LOOKUPS = Rate("radial", 1.5e-10)
 """Of operations of which most look numbers up."""
@@ -39,7 +42,7 @@ def radial_psf(query: Query) -> Tensor:
     wavelengths = query.wavelengths.to(query.device)
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
-    transformed, energy = _transformed(query, scales)
+    transformed, energy = _transformed(query, scales, _corner(query))
     bands = []
     for index, wavelength in enumerate(query.wavelengths.tolist()):
         arguments = (transformed[:, index], scales[index], query, wavelength)
@@ -53,23 +56,26 @@ def radial_psf(query: Query) -> Tensor:
     return torch.stack(bands, dim=1)
 
 
-def _transformed(query: Query, scales: Tensor) -> tuple[Tensor, Tensor]:
-    """U at t = 0, `_TABLE_STEP`, ... as far as the window's corner, (2, L, Z, T); the energy that passes, (1 or Z,).
+def _corner(query: Query) -> float:
+    return math.sqrt(2) * query.half_window
+
+
+def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """U at t = 0, `_TABLE_STEP`, ... as far as a reach [m], (2, L, Z, T); the energy that passes, (1 or Z,).
 
     Args: scales: (L,) t per metre on the sensor.
     """
     wavelengths = query.wavelengths.to(query.device)
-    largest = float(scales.detach().max())
-    corner = math.sqrt(2) * query.half_window
-    rho, weights = ring_nodes(query, largest * corner)
+    largest = float(scales.detach().max()) * reach
+    rho, weights = ring_nodes(query, largest)
     x, y = from_image_side(rho, torch.zeros_like(rho), query.tau)
     pupil = query.pupil(x, y)
     coefficients, maps = residual_path(query, pupil)
     phase = 2 * math.pi / wavelengths[:, None, None] * (coefficients @ maps)  # (L, Z, n)
     amplitude, energy = ring_amplitude(query, pupil, rho * weights)
     field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
-    field, rho = fewer_nodes(field, rho, frequency=largest * corner)
-    steps = math.ceil(largest * corner / _TABLE_STEP) + 8
+    field, rho = fewer_nodes(field, rho, frequency=largest)
+    steps = math.ceil(largest / _TABLE_STEP) + 8
     parts = list(zip(*(part.split(max(1, _RINGS_AT_ONCE // steps), dim=-1) for part in (field, rho)), strict=True))
     if len(parts) == 1:
         return _hankel(field, steps, rho), energy
@@ -77,40 +83,60 @@ def _transformed(query: Query, scales: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([checkpoint(_hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
 
 
-def radial_transfer(query: Query, frequencies: Tensor) -> Tensor:
+def radial_transfer(query: Query) -> Callable[[Tensor, tuple[int, int]], Tensor]:
     """Transfer functions of a rotationally symmetric pupil, of light on pixels, without a picture of its PSF.
 
     H(f) = 1 / (2 pi E) INT |U(t)|^2 J0(kappa t) t dt,   kappa = f lambda d / a
 
-    of what falls into a disc of the window's area, times that of a pixel, and folded at the pixels' own frequency.
+    of what falls into a window in the mean over directions, times that of a pixel, folded at the pixels' frequency.
+    Well beyond its rays light is diffracted at the rim alone: T / r of it falls outside a radius r, see `Lens.window`.
 
-    Args:      frequencies: (F,) along an axis of the pixels [cycles per pixel].
-    Returns:   (Z, L, 2, F) float64, the same along x and y.
+    Returns:   a function of frequencies (F,) along an axis of the pixels [cycles per pixel] and of a window (H, W) that
+               is not larger than the query's: (Z, L, 2, F) float64, the same along x and y.
     """
     wavelengths = query.wavelengths.to(query.device)
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
-    transformed, energy = _transformed(query, scales)
+    rim = wavelengths * d / (2 * math.pi**2) * query.lens.rim_per_area()  # T, (L,)
+    reach = min(_corner(query), float(query.displacement.max()) + float(_BEYOND_RAYS * rim.detach().max()))
+    transformed, energy = _transformed(query, scales, reach)
     t = torch.arange(transformed.shape[-1], dtype=torch.float64, device=query.device) * _TABLE_STEP
-    disc = scales * query.pixel_pitch * math.sqrt(math.prod(query.shape) / math.pi)
-    inside = ((disc[:, None] - t) / _TABLE_STEP + 0.5).clamp(0, 1)
-    intensity = transformed.square().sum(0) * inside[:, None]  # (L, Z, T)
+    intensity = transformed.square().sum(0)  # (L, Z, T)
     count = max(_FEWEST, math.ceil(_PER_FRINGE * 2 * float(t[-1]) / math.pi))
     steps = 2 / (count - 1)  # of kappa, which ends at 2
     kernel = hankel_kernel(t, count, step=steps) / (2 * math.pi)  # (T, count)
-    # the trapezium rule, with Euler and Maclaurin's correction for the slope at the axis
-    table = (intensity * t) @ kernel * _TABLE_STEP + _TABLE_STEP**2 / 12 * intensity[..., :1]
-    table = table / (2 * math.pi * energy[:, None])
-    folds = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64, device=query.device)
-    along, across = frequencies[:, None, None] + folds[:, None], folds
-    pixel = torch.sinc(along * query.grid.active) * torch.sinc(across * query.grid.active)
-    if not query.grid.integrate:
-        pixel = torch.ones_like(pixel)
-    radius = torch.sqrt(along**2 + across**2) / query.pixel_pitch  # (F, 3, 3)
-    place = (wavelengths[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is nothing
-    value = even_between(table, place)
-    found = (value.unflatten(-1, radius.shape) * pixel).sum((-2, -1))
-    return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
+
+    def transfer(frequencies: Tensor, shape: tuple[int, int]) -> Tensor:
+        corner = float(scales.detach().max()) * query.pixel_pitch * math.hypot(*shape) / 2
+        end = min(len(t), math.ceil(corner / _TABLE_STEP) + 1)
+        inside = _share_inside(shape, t[:end] / (scales[:, None] * query.pixel_pitch))
+        within = intensity[..., :end] * inside[:, None]
+        # the trapezium rule, with Euler and Maclaurin's correction for the slope at the axis
+        table = (within * t[:end]) @ kernel[:end] * _TABLE_STEP + _TABLE_STEP**2 / 12 * within[..., :1]
+        table = table / (2 * math.pi * energy[:, None])
+        folds = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64, device=query.device)
+        along, across = frequencies[:, None, None] + folds[:, None], folds
+        pixel = torch.sinc(along * query.grid.active) * torch.sinc(across * query.grid.active)
+        if not query.grid.integrate:
+            pixel = torch.ones_like(pixel)
+        radius = torch.sqrt(along**2 + across**2) / query.pixel_pitch  # (F, 3, 3)
+        place = (wavelengths[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is none
+        value = even_between(table, place)
+        found = (value.unflatten(-1, radius.shape) * pixel).sum((-2, -1))
+        if (edge := math.sqrt(math.prod(shape) / math.pi) * query.pixel_pitch) > reach:  # INT J0(2 pi f r) dr / r^2
+            nodes = 1 / reach + (1 / edge - 1 / reach) * (torch.arange(_TAIL, dtype=torch.float64) + 0.5) / _TAIL
+            tail = BesselJ0.apply(2 * math.pi / query.pixel_pitch * frequencies / nodes[:, None].to(query.device))
+            found = found + (rim * (1 / reach - 1 / edge))[:, None, None] * tail.mean(0)
+        return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
+
+    return transfer
+
+
+def _share_inside(shape: tuple[int, int], radius: Tensor) -> Tensor:
+    """How much of each circle about its middle lies in a window [pixels]."""
+    halves = torch.tensor(shape, dtype=torch.float64, device=radius.device) / 2
+    outside = torch.acos((halves / radius.clamp(min=1e-9)[..., None]).clamp(max=1)).sum(-1)
+    return (1 - 2 / math.pi * outside).clamp(min=0)
 
 
 def even_between(values: Tensor, position: Tensor) -> Tensor:

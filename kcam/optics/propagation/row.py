@@ -25,6 +25,12 @@ PRODUCTS = Rate("matrix", 4e-11)
 FFT_SLOWNESS = 10.0  # operations of a matrix product in the time of one of an FFT, measured on a CPU in float32
 
 
+Transfer = Callable[[Tensor, tuple[int, int]], Tensor]
+"""From frequencies (F,) [cycles per pixel] and a window (h, w) to slices of transfer functions along x and y, of what
+falls into it: (Z, L, 2, F).
+"""
+
+
 class Propagator(nn.Module):
     """A row of the table: a function from `Query` to PSFs, with its range, error estimate and cost.
 
@@ -37,8 +43,7 @@ class Propagator(nn.Module):
             product. A number is for operations of a kind of its own; a `Rate` may be that of other rows.
         exact: whether only sampling separates the row from its physics, so that it may be chosen by cost alone.
         on_grid: whether it samples the pupil on a Cartesian grid, of so many samples as `Query.samples` says.
-        transfer: (query, frequencies (F,) [cycles per pixel]) -> transfer functions (Z, L, 2, F) along x and y, where
-            they are known without the PSFs.
+        transfer: query -> `Transfer`, where transfer functions are known without the PSFs.
         about: what it does, in a line of the documentation.
     Raises: ValueError for a rate that is not > 0.
     """
@@ -56,7 +61,7 @@ class Propagator(nn.Module):
         paraxial: bool = False,
         exact: bool = True,
         on_grid: bool = False,
-        transfer: Callable[[Query, Tensor], Tensor] | None = None,
+        transfer: Callable[[Query], Transfer] | None = None,
         about: str = "",
     ) -> None:
         super().__init__()
@@ -84,11 +89,11 @@ class Propagator(nn.Module):
         with full_precision(query.device):
             return self.function(query.modelled(paraxial=self.paraxial))
 
-    def transfer(self, query: Query, frequencies: Tensor) -> Tensor | None:
-        """Transfer functions (Z, L, 2, F) of slices along x and y, or None where only the PSFs tell."""
+    def transfer(self, query: Query) -> Transfer | None:
+        """The transfer functions of a query, or None where only the PSFs tell."""
         if self.transfer_of is None or self.valid_for(query) is not None:
             return None
-        return self.transfer_of(query.modelled(paraxial=self.paraxial), frequencies)
+        return self.transfer_of(query.modelled(paraxial=self.paraxial))
 
     def valid_for(self, query: Query) -> str | None:
         """Why the row cannot answer a query, or None."""
