@@ -26,6 +26,9 @@ FEW_LAYERS, TAIL = 3, 16
 ORDERS = (1.0, 1.5)
 """A ladder's error falls at least with such a power of its step: one where phases jump, two where it is fine enough."""
 
+FASTEST = 3.0
+"""With which power of its step no ladder's error falls."""
+
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
 
@@ -112,9 +115,10 @@ class Ladder:
         """
         if self.position == 0:
             return self._by_the_next(evaluator)
-        known = [self.beside | level.changes for level in self.levels[max(0, self.position - 2) : self.position + 1]]
+        below = sorted({position for position, _ in self.errors if position < self.position})[-2:]
+        known = [self.beside | self.levels[position].changes for position in (*below, self.position)]
         steps = [evaluator.error(below, above) for below, above in pairwise(known)]
-        last = self.level.fineness / self.levels[self.position - 1].fineness
+        last = self.level.fineness / self.levels[below[-1]].fineness
         order = ORDERS[0]
         if len(steps) > 1 and 0 < steps[1] < steps[0]:
             order = min(max(math.log(steps[0] / steps[1]) / math.log(last), order), ORDERS[1])
@@ -127,22 +131,31 @@ class Ladder:
         last = self.position + 2 == len(self.levels)
         return step if last else step / (1 - (self.level.fineness / upper.fineness) ** ORDERS[1])
 
-    def climb(self, evaluator: Evaluator) -> None:
-        """One rung up, and its error; first, what that rung says of this one, which may then do."""
+    def climb(self, evaluator: Evaluator, most: float) -> None:
+        """One rung up, and its error, of which there may be so much at most; first, what that rung says of this one,
+        which may then do. Rungs that cannot do, at the fastest that errors fall, are not looked at.
+        """
         key, two_up = self._key(self.position), self.position + 2
         if self.successive and self.position > 0 and two_up < len(self.levels) and key not in self.compared:
             self.compared.add(key)
             self.errors[key] = self._by_the_next(evaluator)
             return
+        before = self.position
         self.position += 1
+        while self.successive and before and not self.at_top and self._at_best(before) > most:
+            self.position += 1
         self.price(evaluator)
+
+    def _at_best(self, known: int) -> float:
+        """The error of this rung, if from a known one it fell as fast as any."""
+        return self.errors[self._key(known)] * (self.levels[known].fineness / self.level.fineness) ** FASTEST
 
     def why(self) -> str:
         """The number that decided."""
         if self.position == 0:
             return "" if len(self.levels) == 1 else "the least there is suffices"
-        below = max((key for key in self.errors if key[0] == self.position - 1), key=lambda key: key[1])
-        return f"{self.levels[self.position - 1].label} would cost {self.errors[below]:.2g}"
+        below = max(key for key in self.errors if key[0] < self.position)
+        return f"{self.levels[below[0]].label} would cost {self.errors[below]:.2g}"
 
 
 def ladders(evaluator: Evaluator, scene: Scene) -> list[Ladder]:

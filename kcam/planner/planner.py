@@ -154,7 +154,7 @@ class Planner:
                 self._checked[key] = self.evaluator.last(changes, skipped)
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
-            max(below, key=_urgency).climb(self.evaluator)
+            max(below, key=_urgency).climb(self.evaluator, allowed / SAFETY)
 
     def _ways(self) -> tuple[list[Ladder], list[_Skip]]:
         """All choices."""
@@ -229,15 +229,19 @@ def _relevant(steps: Sequence[Ladder]) -> list[Ladder]:
 
 
 def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator, most: float) -> None:
-    """One rung at a time, on the ladder with the largest error, until their sum fits."""
+    """One rung at a time, on the ladder with the largest error, until their sum fits; those that follow others last."""
     movable: list[Any] = [skip for skip in skips if skip.counted]
     while True:
         relevant: list[Any] = [*_relevant(steps), *movable]
-        for ladder in relevant:
-            ladder.price(evaluator)
-        if sum(ladder.error for ladder in relevant) <= most:
+        for follows in (False, True):
+            own = [ladder for ladder in relevant if follows or not (isinstance(ladder, Ladder) and ladder.follows)]
+            for ladder in own:
+                ladder.price(evaluator)
+            if sum(ladder.error for ladder in own) > most:
+                max(own, key=_urgency).climb(evaluator, most)
+                break
+        else:
             return
-        max(relevant, key=_urgency).climb(evaluator)
 
 
 def _urgency(way: Ladder | _Skip) -> float:
@@ -271,7 +275,7 @@ class _Skip:
     def price(self, evaluator: Evaluator) -> None:
         """It is known."""
 
-    def climb(self, evaluator: Evaluator) -> None:
+    def climb(self, evaluator: Evaluator, most: float) -> None:
         """Keep the stage."""
         self.position = 1
 

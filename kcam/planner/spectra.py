@@ -42,6 +42,7 @@ WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
+_FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 1e-4  # of a scene's light, that planes of fewer spectra may leave out
 FEW_BANDS = 3
@@ -77,7 +78,8 @@ class Spectra:
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
-        self._tables: dict[Any, _Table | None] = {}
+        self._tables: dict[Any, _Table] = {}
+        self._untabled: set[Any] = set()  # propagators
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -188,7 +190,7 @@ class Spectra:
         window = self._window(imaging, vergences)
         if (known := self._table(imaging, vergences, wavelengths)) is not None:
             places = [known.wavelengths.index(one) for one in wavelengths.tolist()]
-            found = known.transfer(self.frequencies, window).cpu()[:, places]
+            found = known.transfer(self.frequencies, window, places).cpu()
         else:
             found = self._slices(imaging, vergences, wavelengths, window)
         return found / found[..., :1] if imaging.accuracy.renormalise else found
@@ -223,16 +225,21 @@ class Spectra:
     def _table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
         """Transfer functions of these wavelengths and others, where optics know them without PSFs.
 
-        A few wavelengths have a table, and all for which PSFs may stand another.
+        Of many layers a few wavelengths have a table, else all for which PSFs may stand.
         """
-        some = self._few if set(wavelengths.tolist()) <= set(self._few.tolist()) else self._every
+        if imaging.accuracy.propagator in self._untabled:
+            return None
+        some = self._few if len(vergences) > _FEW_LAYERS else self._every
         if not set(wavelengths.tolist()) <= set(some.tolist()):
-            some = wavelengths
+            some = torch.cat([self._every, wavelengths]).unique()
         key = imaging.accuracy.propagator, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
             query = self._query(imaging, vergences, some, self._window(self.imaging, vergences))  # none is larger
             transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
-            self._tables[key] = None if transfer is None else _Table(some.tolist(), transfer)
+            if transfer is None:
+                self._untabled.add(imaging.accuracy.propagator)
+                return None
+            self._tables[key] = _Table(some.tolist(), transfer)
         return self._tables[key]
 
 

@@ -42,8 +42,10 @@ KINDS = (
 )
 """What a tile may have much of."""
 
-OF_DEPTH, NEIGHBOURS, BEYOND = KINDS[2:5], 5, 6
-"""The kinds that nothing but depth makes hurt; the contrast between neighbours; and what the full well cuts off."""
+OF_DEPTH, BEHIND, NEIGHBOURS, BEYOND = KINDS[2:5], 4, 5, 6
+"""The kinds that nothing but depth makes hurt, and one of them; the contrast between neighbours; and what the full well
+cuts off.
+"""
 
 CLIPPING = (ShotNoise, DarkCurrent, Clip)
 """Stages that stop at the full well."""

@@ -70,7 +70,7 @@ def test_transfer_functions_are_those_of_the_psf(seed: int) -> None:
     row = RADIAL if draw.one_of(True, False) else RADIAL.in_fresnel_range()
     query = lens.question(Points(vergences), wavelengths, pixels)
     frequencies = torch.linspace(0.05, math.sqrt(0.5), 60, dtype=torch.float64)
-    found, psfs = row.transfer(query)(frequencies, (129, 129)), row(query)
+    found, psfs = row.transfer(query)(frequencies, (129, 129), range(4)), row(query)
     x = torch.arange(129, dtype=torch.float64) - 64
     expected = psfs.sum(-2) @ torch.cos(2 * math.pi * x[:, None] * frequencies)
     assert found.shape == (2, 4, 2, 60)
@@ -98,5 +98,27 @@ def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int)
         truth = left(counts[ladder.position]) - left(total)
         assert 0.65 * truth < ladder.error < 6 * truth, (counts[ladder.position], len(seen))
         seen.append(ladder.position)
-        ladder.climb(evaluator)
+        ladder.climb(evaluator, math.inf)
     assert len(seen) > len(set(seen))  # some were looked at twice before they were left
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("most", [0.5, 0.03, 1e-3])
+def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> None:
+    """However fast errors fall, the rung that is reached does, and no rung before it that was passed over would have."""
+    counts = [*even_counts(128), 128]
+    asked: set[int] = set()
+
+    def step(ours: dict, theirs: dict) -> float:
+        asked.update((ours["bands"], theirs["bands"]))
+        return float(ours["bands"]) ** -order - float(theirs["bands"]) ** -order
+
+    evaluator = SimpleNamespace(error=step)
+    ladder = Ladder("wavelengths", [Level(str(n), {"bands": n}, n) for n in counts], {}, successive=True)
+    ladder.price(evaluator)
+    while ladder.error > most and not ladder.at_top:
+        ladder.climb(evaluator, most)
+    truth = counts[ladder.position] ** -order - counts[-1] ** -order
+    assert ladder.at_top or truth <= 1.6 * most
+    for n in set(counts[: ladder.position]) - asked:
+        assert n**-order - counts[-1] ** -order > most

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from kcam.optics.numerics import BesselJ0, lagrange
 from kcam.optics.propagation.estimates import paraxial_error, trace
 from kcam.optics.propagation.question import Query, radial_phase, residual_path
 from kcam.optics.propagation.rings import fewer_nodes, panel_nodes, panel_orders
-from kcam.optics.propagation.row import Propagator, Rate
+from kcam.optics.propagation.row import Propagator, Rate, Transfer
 from kcam.optics.pupil.coordinates import Pupil, from_image_side
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
@@ -83,7 +83,7 @@ def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Te
     return torch.stack([checkpoint(_hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
 
 
-def radial_transfer(query: Query) -> Callable[[Tensor, tuple[int, int]], Tensor]:
+def radial_transfer(query: Query) -> Transfer:
     """Transfer functions of a rotationally symmetric pupil, of light on pixels, without a picture of its PSF.
 
     H(f) = 1 / (2 pi E) INT |U(t)|^2 J0(kappa t) t dt,   kappa = f lambda d / a
@@ -91,8 +91,7 @@ def radial_transfer(query: Query) -> Callable[[Tensor, tuple[int, int]], Tensor]
     of what falls into a window in the mean over directions, times that of a pixel, folded at the pixels' frequency.
     Well beyond its rays light is diffracted at the rim alone: T / r of it falls outside a radius r, see `Lens.window`.
 
-    Returns:   a function of frequencies (F,) along an axis of the pixels [cycles per pixel] and of a window (H, W) that
-               is not larger than the query's: (Z, L, 2, F) float64, the same along x and y.
+    Returns:   float64, the same along x and y.
     """
     wavelengths = query.wavelengths.to(query.device)
     a, d = query.image_side_semi_aperture, query.sensor_distance
@@ -106,11 +105,12 @@ def radial_transfer(query: Query) -> Callable[[Tensor, tuple[int, int]], Tensor]
     steps = 2 / (count - 1)  # of kappa, which ends at 2
     kernel = hankel_kernel(t, count, step=steps) / (2 * math.pi)  # (T, count)
 
-    def transfer(frequencies: Tensor, shape: tuple[int, int]) -> Tensor:
-        corner = float(scales.detach().max()) * query.pixel_pitch * math.hypot(*shape) / 2
+    def transfer(frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
+        chosen = torch.as_tensor(bands, device=query.device)
+        scale, length, light = scales[chosen], wavelengths[chosen], intensity[chosen]
+        corner = float(scale.detach().max()) * query.pixel_pitch * math.hypot(*shape) / 2
         end = min(len(t), math.ceil(corner / _TABLE_STEP) + 1)
-        inside = _share_inside(shape, t[:end] / (scales[:, None] * query.pixel_pitch))
-        within = intensity[..., :end] * inside[:, None]
+        within = light[..., :end] * _share_inside(shape, t[:end] / (scale[:, None] * query.pixel_pitch))[:, None]
         # the trapezium rule, with Euler and Maclaurin's correction for the slope at the axis
         table = (within * t[:end]) @ kernel[:end] * _TABLE_STEP + _TABLE_STEP**2 / 12 * within[..., :1]
         table = table / (2 * math.pi * energy[:, None])
@@ -120,13 +120,13 @@ def radial_transfer(query: Query) -> Callable[[Tensor, tuple[int, int]], Tensor]
         if not query.grid.integrate:
             pixel = torch.ones_like(pixel)
         radius = torch.sqrt(along**2 + across**2) / query.pixel_pitch  # (F, 3, 3)
-        place = (wavelengths[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is none
+        place = (length[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is nothing
         value = even_between(table, place)
         found = (value.unflatten(-1, radius.shape) * pixel).sum((-2, -1))
         if (edge := math.sqrt(math.prod(shape) / math.pi) * query.pixel_pitch) > reach:  # INT J0(2 pi f r) dr / r^2
             nodes = 1 / reach + (1 / edge - 1 / reach) * (torch.arange(_TAIL, dtype=torch.float64) + 0.5) / _TAIL
             tail = BesselJ0.apply(2 * math.pi / query.pixel_pitch * frequencies / nodes[:, None].to(query.device))
-            found = found + (rim * (1 / reach - 1 / edge))[:, None, None] * tail.mean(0)
+            found = found + (rim[chosen] * (1 / reach - 1 / edge))[:, None, None] * tail.mean(0)
         return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
 
     return transfer

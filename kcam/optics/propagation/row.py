@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from torch import Tensor, nn
@@ -25,9 +25,10 @@ PRODUCTS = Rate("matrix", 4e-11)
 FFT_SLOWNESS = 10.0  # operations of a matrix product in the time of one of an FFT, measured on a CPU in float32
 
 
-Transfer = Callable[[Tensor, tuple[int, int]], Tensor]
-"""From frequencies (F,) [cycles per pixel] and a window (h, w) to slices of transfer functions along x and y, of what
-falls into it: (Z, L, 2, F).
+Transfer = Callable[[Tensor, tuple[int, int], Sequence[int]], Tensor]
+"""From frequencies (F,) along an axis of the pixels [cycles per pixel], a window (h, w) that is not larger than the
+query's, and indices of L of its wavelengths, to slices of the transfer functions along x and y of what falls into that
+window: (Z, L, 2, F).
 """
 
 
