@@ -96,7 +96,8 @@ class Camera(nn.Module):
 
         Args:      scene: a Scene, or its bands (B,L,H,W) at the context's wavelengths.
                    generator: source of all noise; None for torch's default one.
-                   tolerance: None for the reference physics; else the picture is planned for afresh: see `plan`.
+                   tolerance: None for the reference physics; else the picture is planned for where that pays: see
+                   `kcam.planner.shoot`.
         Returns:   (B,C,H,W), what the last stage gives: sRGB in [0,1] from a camera that ends in ToneCurve.
         Raises:    TypeError for anything else than a scene or a tensor, or a generator that is none; ValueError for a
                    tolerance where gradients are recorded: training must not plan anew at each step.
@@ -109,7 +110,9 @@ class Camera(nn.Module):
                 )
             if not isinstance(scene, Scene):
                 raise TypeError(f"tolerance= plans for a Scene, got {type(scene).__name__}. Use Scene.from_bands(...).")
-            return self.plan(scene, tolerance=tolerance).apply(self)(scene, generator=generator)
+            from kcam.planner import shoot
+
+            return shoot(self, scene, tolerance=tolerance, generator=generator)[0]
         picture: Any = scene.bands() if isinstance(scene, Scene) and not len(self) else scene
         for _, picture in self.steps(scene, generator=generator):  # noqa: B007 (the last one stays)
             pass

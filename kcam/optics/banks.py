@@ -7,10 +7,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from kcam.cache import value_of
 from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.optics.source import PixelGrid
 
@@ -27,17 +29,18 @@ Compute = Callable[[Tensor, Tensor, PixelGrid, bool], Tensor]
 """PSFs (F, Z, L, h, w) of places (F, 2), at wavelengths (L,), on pixels, whole or not: see `source.FieldPSFs`."""
 
 
+@dataclass(frozen=True)
 class KnownPSFs:
     """PSFs of points on the axis, each kept by itself: a smaller window has the middle of a larger one. For a planner,
     which asks for the same ones again and again; up to `KEPT` bytes.
 
     ends: wavelengths (2,) that are computed with those asked for, so that any part of a spectrum is computed alike.
+    psfs: (h, w), by all that they depend on. others: what else is known of the same optics, see `keep`.
     """
 
-    def __init__(self, ends: Tensor) -> None:
-        self.ends = ends
-        self._known: dict[tuple[object, ...], Tensor] = {}
-        self._held = 0.0
+    ends: Tensor
+    psfs: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
+    others: dict[tuple[object, ...], Any] = field(default_factory=dict, repr=False)
 
     def bank(self, how: object, vergences: Tensor, wavelengths: Tensor, pixels: PixelGrid, compute: OnAxis) -> Tensor:
         """PSFs (Z, L, h, w); how: what else they depend on."""
@@ -46,19 +49,25 @@ class KnownPSFs:
         missing = torch.tensor([[not self._holds((row, column), pixels.shape) for column in columns] for row in rows])
         if bool(missing.any()):
             size = math.prod(missing.shape) * math.prod(pixels.shape) * pixels.dtype.itemsize
-            if self._held + size > KEPT:
+            if sum(psf.nbytes for psf in self.psfs.values()) + size > KEPT:
                 return compute(vergences, wavelengths, pixels)
-            self._held += size
             layers, colours = vergences[missing.any(1).to(vergences.device)], wavelengths[missing.any(0)]
             asked = torch.cat([colours, self.ends.to(colours)]).unique()
             for value, psfs in zip(layers.tolist(), compute(layers, asked, pixels), strict=True):
-                self._known |= {((how, value), (how, w)): psf for w, psf in zip(asked.tolist(), psfs, strict=True)}
+                self.psfs.update({((how, value), (how, w)): psf for w, psf in zip(asked.tolist(), psfs, strict=True)})
         return torch.stack(
-            [torch.stack([_middle(self._known[row, column], pixels.shape) for column in columns]) for row in rows]
+            [torch.stack([_middle(self.psfs[row, column], pixels.shape) for column in columns]) for row in rows]
         )
 
+    def keep(self, key: tuple[object, ...], value: Any) -> None:
+        """Know a dataclass of tensors too, while all of these are together below `KEPT` bytes."""
+        tensors: list[Tensor] = []
+        value_of((*self.others.values(), value), tensors)
+        if sum(tensor.nbytes for tensor in tensors) <= KEPT:
+            self.others[key] = value
+
     def _holds(self, key: tuple[object, ...], shape: tuple[int, int]) -> bool:
-        known = self._known.get(key)
+        known = self.psfs.get(key)
         return known is not None and all(n >= m for n, m in zip(known.shape, shape, strict=True))
 
 

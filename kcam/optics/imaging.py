@@ -122,7 +122,8 @@ class Imaging(Stage):
         self._traced_cache, self._field_cache = ValueCache(_TRACED), ValueCache()
         self._window_cache = ValueCache(_TRACED)
         self._reach: float | None = None  # from the axis, of the picture of which this is a part [m]
-        self._known: KnownPSFs | None = None  # while the lens stays as it is
+        self.known: KnownPSFs | None = None  # while the lens stays as it is, see `knowing`
+        self._known_cache = ValueCache()
         self._check_recipe()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -154,7 +155,7 @@ class Imaging(Stage):
         changed = Imaging(**(self.configuration() | arguments))
         changed._warns = self._warns and "layers" not in arguments
         changed._traced_cache, changed._window_cache = self._traced_cache, self._window_cache
-        changed._reach, changed._known = self._reach, self._known
+        changed._reach, changed.known = self._reach, self.known
         if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
             changed._field_cache = self._field_cache
         return changed
@@ -162,17 +163,17 @@ class Imaging(Stage):
     def fresh(self) -> Imaging:
         """The same stage that has kept nothing, but for the pupils that were traced."""
         own = self.changed()
-        own._field_cache, own._window_cache, own._known = ValueCache(), ValueCache(_TRACED), None
+        own._field_cache, own._window_cache, own.known = ValueCache(), ValueCache(_TRACED), None
         return own
 
     def knowing(self, wavelengths: Tensor) -> Imaging:
         """The same stage, which keeps each PSF that it and those changed from it compute without gradients, for scenes
-        of these wavelengths: as long as the lens stays what it is, which is not asked.
+        of these wavelengths, as `known`: by what this stage is now, and until it is asked again.
         """
         own = self.changed()
         if not self.varies and self._positions is None:
             ends = torch.stack(wavelengths.aminmax()) if getattr(self.lens, "symmetric", False) else wavelengths[:0]
-            own._known = KnownPSFs(ends)
+            own.known = self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends))
         return own
 
     def _check_recipe(self) -> None:
@@ -294,10 +295,10 @@ class Imaging(Stage):
                 return self.lens.bank(own, wavelengths, pixels, self.accuracy)
             return self.lens.bank(own, wavelengths, pixels)
 
-        if self._known is None or torch.is_grad_enabled():
+        if self.known is None or torch.is_grad_enabled():
             return compute(points.vergences, wavelengths, pixels)
         how = tuple(getattr(self.accuracy, field.name) for field in fields(Recipe))
-        return self._known.bank(how, points.vergences, wavelengths, pixels, compute)
+        return self.known.bank(how, points.vergences, wavelengths, pixels, compute)
 
     def computed_lens(self, *, by: str) -> Lens:
         """The lens, for what asks it more than PSFs. Raises: ValueError, which says `by` whom, where there is none."""

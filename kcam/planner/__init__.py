@@ -10,7 +10,7 @@ from kcam.planner.plan import (
     relative_rms,
     with_imaging,
 )
-from kcam.planner.planner import Planner, explain, make_plan, measured, timed
+from kcam.planner.planner import Planner, explain, make_plan, measured, shoot, timed
 
 __all__ = [
     "Decision",
@@ -24,6 +24,7 @@ __all__ = [
     "measured",
     "noiseless_raw",
     "relative_rms",
+    "shoot",
     "timed",
     "with_imaging",
 ]

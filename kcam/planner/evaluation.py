@@ -118,7 +118,8 @@ class Evaluator:
         self.signals = self._signals(few)
         if self.imaging is not None and not self.gradients and not self.varies and linear(self.raw_camera):
             self.spectra = [
-                Spectra(self.raw_camera, self.imaging, sample.scene, picture=sample.picture) for sample in self.samples
+                Spectra.of(self.raw_camera, self.imaging, sample.scene, picture=sample.picture)
+                for sample in self.samples
             ]
 
     @property
@@ -160,9 +161,7 @@ class Evaluator:
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
             return _error(self.samples, self.answers(changes), self.answers(against))
         if changes.get("occlusion") != against.get("occlusion"):
-            behind = max(float(one.relative()[BEHIND]) for one in self.items)
-            if (hidden := MOST_HIDDEN * math.sqrt(behind)) < HARDLY:
-                return hidden
+            return self._hidden(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
             energies = torch.stack(spectra.energies(changes, against))
@@ -170,6 +169,19 @@ class Evaluator:
                 off, all_of_it = energies[:, rows].sum(1).tolist()
                 lost = self.lost[sample.owners[rows[0]]]
                 found.append(factor * lost * math.sqrt(off / all_of_it) if all_of_it else 0.0)
+        return max(found)
+
+    def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
+        """The error of what does not hide what it should: of the scene with most light behind edges of depth."""
+        behind = [float(one.relative()[BEHIND]) for one in self.items]
+        if (most := MOST_HIDDEN * math.sqrt(max(behind))) < HARDLY:
+            return most
+        worst, found = max({*self.lost}, key=behind.__getitem__), [0.0]
+        for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
+            for rows, factor in sample.of_owners():
+                if sample.owners[rows[0]] == worst:
+                    off, all_of_it = torch.stack(spectra.hiding(changes, against, rows)).sum(1).tolist()
+                    found.append(factor * self.lost[worst] * math.sqrt(off / all_of_it) if all_of_it else 0.0)
         return max(found)
 
     def last(self, changes: Mapping[str, Any], skipped: Sequence[int]) -> float:

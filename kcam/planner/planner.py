@@ -18,10 +18,13 @@ from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw
+from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw, shortened
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
+
+WORTH = 0.3
+"""Predicted seconds of a reference picture up to which a plan for it alone takes longer than it saves: measured."""
 
 SENSOR = "sensor"
 """The tolerance that follows from what a sensor records."""
@@ -60,6 +63,24 @@ def make_plan(
     """
     check_tolerance(tolerance)
     return Planner(camera, scenes, max_memory=max_memory).plan(tolerance)
+
+
+def shoot(
+    camera: Camera, scene: Scene, *, tolerance: float | str, generator: torch.Generator | None = None
+) -> tuple[torch.Tensor, Plan]:
+    """One picture within a tolerance, and the plan for it, made and used where that pays: with the PSFs that making it
+    took, and with the reference physics where all of it takes less than a plan (`WORTH`).
+
+    Arguments and errors: as `make_plan`, and as `Camera`.
+    """
+    check_tolerance(tolerance)
+    planner = Planner(camera, scene)
+    plan = planner.plan(tolerance if planner.prices.of({})[0] > WORTH else 0)
+    stages = list(camera)
+    if planner.evaluator.index is not None and planner.evaluator.imaging is not None:
+        stages[planner.evaluator.index] = planner.evaluator.imaging
+    short = shortened(Camera(*stages, context=camera.context), plan.changes, plan.skipped)
+    return short(scene, generator=generator), dataclasses.replace(plan, tolerance=tolerance)
 
 
 class Planner:

@@ -14,7 +14,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from scipy.fft import dctn
@@ -61,7 +61,8 @@ class _Layered:
     crossed: Tensor
 
 
-class _Table(NamedTuple):
+@dataclass(frozen=True)
+class _Table:
     """Wavelengths, and their transfer functions."""
 
     wavelengths: list[float]
@@ -69,17 +70,40 @@ class _Table(NamedTuple):
 
 
 class Spectra:
-    """A batch of scenes before a camera, as spectra; picture: (H, W) of the wholes that they are part of."""
+    """A batch of scenes as spectra, before optics and sums over the bands (R, L) that a sensor records, or all bands.
 
-    def __init__(self, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int]) -> None:
-        self.imaging, self.scene, self.picture = imaging, _compressed(scene), picture
-        self.weights = _recorded(camera, scene)
+    picture: (H, W) of the wholes that they are part of. wavelengths: of the light, of which the scene may have a few.
+    """
+
+    def __init__(
+        self, imaging: Imaging, scene: Scene, weights: Tensor | None, *, picture: tuple[int, int], wavelengths: Tensor
+    ) -> None:
+        self.imaging, self.scene, self.weights = imaging, scene, weights
+        self.picture, self.wavelengths = picture, wavelengths
         self.frequencies = _rings()
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
-        self._tables: dict[Any, _Table] = {}
         self._untabled: set[Any] = set()  # propagators
+        self._tables: dict[Any, _Table] = {} if imaging.known is None else dict(imaging.known.others)
+
+    @classmethod
+    def of(cls, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int]) -> Spectra:
+        """Those before a camera."""
+        recorded, wavelengths = _recorded(camera, scene), scene.wavelengths
+        return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths)
+
+    @functools.cached_property
+    def grey(self) -> Spectra:
+        """The same in grey light of a few wavelengths: depth, and what hides what, have no colour, but lenses have."""
+        scene, few = self.scene, self._few
+        spectra = torch.eye(len(scene.wavelengths)) if scene.spectra is None else scene.spectra
+        weights = torch.ones(1, len(scene.wavelengths)) if self.weights is None else self.weights.abs()
+        shares = (weights.sum(0).to(spectra) @ spectra.T).to(scene.coefficients)
+        light = torch.einsum("k,bkhw->bhw", shares, scene.coefficients)[:, None]
+        even = torch.ones(1, len(few)).to(spectra)
+        grey = replace(scene, coefficients=light, spectra=even, wavelengths=few, illuminant=even[0])
+        return Spectra(self.imaging, grey, None, picture=self.picture, wavelengths=self.wavelengths)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -89,12 +113,12 @@ class Spectra:
 
     @functools.cached_property
     def _few(self) -> Tensor:
-        return self.imaging.changed(bands=FEW_BANDS).psf_wavelengths(self.scene.wavelengths)
+        return self.imaging.changed(bands=FEW_BANDS).psf_wavelengths(self.wavelengths)
 
     @functools.cached_property
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
-        own = self.scene.wavelengths
+        own = self.wavelengths
         groups = (self.imaging.changed(bands=n).psf_wavelengths(own) for n in (None, FEW_BANDS, *even_counts(len(own))))
         return torch.cat([*groups, self.imaging.psf_wavelengths(own)]).unique()
 
@@ -102,8 +126,18 @@ class Spectra:
         """For each row: the energy of the difference that changes make, and that of what it is against, (B,); of
         different layers, where that has the finer ones.
         """
-        if changes.get("occlusion") != against.get("occlusion"):
-            return self._hiding(changes, against)
+        if changes.get("layers") == against.get("layers"):
+            return self._linear(changes, against)
+        return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
+
+    def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
+        """The same of some rows, and of what hides what: tried out."""
+        grey = self.grey.scene.samples(rows)
+        changed = (self.imaging.changed(**{**own, "bands": None}) for own in (changes, against))
+        ours, theirs = (imaging(grey).double().cpu() for imaging in changed)
+        return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
+
+    def _linear(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
@@ -113,20 +147,6 @@ class Spectra:
             hidden = len(layered.vergences) > 1 and self.imaging.accuracy.occlusion
             found[0, rows] *= (_HIDDEN if hidden else 1.0) ** 2
         return found[0] * (1.0 if self.fits else _CUT) ** 2, found[1]
-
-    def _hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """The same, tried out on grey light of a few wavelengths: what hides what has no colour, but lenses have."""
-        scene, few = self.scene, self._few
-        spectra = torch.eye(len(scene.wavelengths)) if scene.spectra is None else scene.spectra
-        weights = torch.ones(1, len(scene.wavelengths)) if self.weights is None else self.weights.abs()
-        shares = weights.sum(0).to(spectra) @ spectra.T
-        grey = torch.einsum("k,bkhw->bhw", shares.to(scene.coefficients), scene.coefficients)[:, None]
-        even = torch.ones(1, len(few)).to(spectra)
-        seen = replace(scene, coefficients=grey, spectra=even, wavelengths=few, illuminant=even[0])
-        ours, theirs = (
-            self.imaging.changed(**{**own, "bands": None})(seen).double().cpu() for own in (changes, against)
-        )
-        return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
@@ -206,14 +226,14 @@ class Spectra:
         return torch.stack(slices, dim=2)
 
     def _window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
-        return imaging.psf_window(self.scene.wavelengths, vergences=vergences, picture=self.picture)
+        return imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
 
     @functools.cached_property
     def fits(self) -> bool:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
         vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
         ends = torch.stack([vergences.min(), vergences.max()])
-        query = self._query(self.imaging, ends, self.scene.wavelengths, self._window(self.imaging, ends))
+        query = self._query(self.imaging, ends, self.wavelengths, self._window(self.imaging, ends))
         return query is None or _inside(query)
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
@@ -232,14 +252,17 @@ class Spectra:
         some = self._few if len(vergences) > _FEW_LAYERS else self._every
         if not set(wavelengths.tolist()) <= set(some.tolist()):
             some = torch.cat([self._every, wavelengths]).unique()
-        key = imaging.accuracy.propagator, tuple(vergences.tolist()), tuple(some.tolist())
+        window = self._window(self.imaging, vergences)  # none is larger
+        key = imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
-            query = self._query(imaging, vergences, some, self._window(self.imaging, vergences))  # none is larger
+            query = self._query(imaging, vergences, some, window)
             transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
             if transfer is None:
                 self._untabled.add(imaging.accuracy.propagator)
                 return None
             self._tables[key] = _Table(some.tolist(), transfer)
+            if imaging.known is not None:
+                imaging.known.keep(key, self._tables[key])
         return self._tables[key]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from kcam.optics.numerics import BesselJ0, lagrange
 from kcam.optics.propagation.estimates import paraxial_error, trace
 from kcam.optics.propagation.question import Query, radial_phase, residual_path
 from kcam.optics.propagation.rings import fewer_nodes, panel_nodes, panel_orders
-from kcam.optics.propagation.row import Propagator, Rate, Transfer
+from kcam.optics.propagation.row import Propagator, Rate
 from kcam.optics.pupil.coordinates import Pupil, from_image_side
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
@@ -83,7 +84,8 @@ def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Te
     return torch.stack([checkpoint(_hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
 
 
-def radial_transfer(query: Query) -> Transfer:
+@dataclass(frozen=True)
+class RadialTransfer:
     """Transfer functions of a rotationally symmetric pupil, of light on pixels, without a picture of its PSF.
 
     H(f) = 1 / (2 pi E) INT |U(t)|^2 J0(kappa t) t dt,   kappa = f lambda d / a
@@ -91,45 +93,66 @@ def radial_transfer(query: Query) -> Transfer:
     of what falls into a window in the mean over directions, times that of a pixel, folded at the pixels' frequency.
     Well beyond its rays light is diffracted at the rim alone: T / r of it falls outside a radius r, see `Lens.window`.
 
-    Returns:   float64, the same along x and y.
+    Args:      light: |U|^2 t dt / (4 pi^2 E) at even t, (L, Z, T), with Euler and Maclaurin's correction at 0.
+               kernel: 2 pi J0(kappa t) at even kappa up to 2, (T, K).
+               step: of t [pixels], (L,). kappa: entries of the kernel for each cycle per pixel, (L,).
+               rim: T [pixels], (L,). reach: where the table ends [pixels].
+               active: width of the light-sensitive part of a pixel; None where no pixel is integrated over.
     """
-    wavelengths = query.wavelengths.to(query.device)
+
+    light: Tensor
+    kernel: Tensor
+    step: Tensor
+    kappa: Tensor
+    rim: Tensor
+    reach: float
+    active: float | None
+
+    def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
+        """As `Transfer`: float64, the same along x and y."""
+        frequencies, chosen = frequencies.to(self.light.device), torch.as_tensor(bands, device=self.light.device)
+        step, kappa = self.step[chosen], self.kappa[chosen]
+        end = min(self.light.shape[-1], math.ceil(math.hypot(*shape) / 2 / float(step.detach().min())) + 1)
+        inside = _share_inside(shape, torch.arange(end, device=step.device) * step[:, None])
+        table = (self.light[chosen, :, :end] * inside[:, None]) @ self.kernel[:end]  # (L, Z, K)
+        folds = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64, device=step.device)
+        along, across = frequencies[:, None, None] + folds[:, None], folds
+        radius = torch.sqrt(along**2 + across**2)  # (F, 3, 3)
+        place = (kappa[:, None] * radius.flatten()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
+        value = even_between(table, place).unflatten(-1, radius.shape)
+        if self.active is not None:
+            value = value * torch.sinc(along * self.active) * torch.sinc(across * self.active)
+        found = value.sum((-2, -1))
+        if (edge := math.sqrt(math.prod(shape) / math.pi)) > self.reach:  # INT J0(2 pi f r) dr / r^2
+            share = (torch.arange(_TAIL, dtype=torch.float64, device=step.device) + 0.5) / _TAIL
+            nodes = 1 / self.reach + (1 / edge - 1 / self.reach) * share
+            tail = BesselJ0.apply(2 * math.pi * frequencies / nodes[:, None]).mean(0)
+            found = found + (self.rim[chosen] * (1 / self.reach - 1 / edge))[:, None, None] * tail
+        return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
+
+
+def radial_transfer(query: Query) -> RadialTransfer:
+    """The transfer functions of a query: one Hankel transform of its pupil, and another of the light on the sensor."""
+    wavelengths, pitch = query.wavelengths.to(query.device), query.pixel_pitch
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
-    rim = wavelengths * d / (2 * math.pi**2) * query.lens.rim_per_area()  # T, (L,)
+    rim = wavelengths * d / (2 * math.pi**2) * query.lens.rim_per_area()
     reach = min(_corner(query), float(query.displacement.max()) + float(_BEYOND_RAYS * rim.detach().max()))
     transformed, energy = _transformed(query, scales, reach)
     t = torch.arange(transformed.shape[-1], dtype=torch.float64, device=query.device) * _TABLE_STEP
     intensity = transformed.square().sum(0)  # (L, Z, T)
+    light = intensity * t * _TABLE_STEP
+    light[..., 0] = _TABLE_STEP**2 / 12 * intensity[..., 0]
     count = max(_FEWEST, math.ceil(_PER_FRINGE * 2 * float(t[-1]) / math.pi))
-    steps = 2 / (count - 1)  # of kappa, which ends at 2
-    kernel = hankel_kernel(t, count, step=steps) / (2 * math.pi)  # (T, count)
-
-    def transfer(frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
-        chosen = torch.as_tensor(bands, device=query.device)
-        scale, length, light = scales[chosen], wavelengths[chosen], intensity[chosen]
-        corner = float(scale.detach().max()) * query.pixel_pitch * math.hypot(*shape) / 2
-        end = min(len(t), math.ceil(corner / _TABLE_STEP) + 1)
-        within = light[..., :end] * _share_inside(shape, t[:end] / (scale[:, None] * query.pixel_pitch))[:, None]
-        # the trapezium rule, with Euler and Maclaurin's correction for the slope at the axis
-        table = (within * t[:end]) @ kernel[:end] * _TABLE_STEP + _TABLE_STEP**2 / 12 * within[..., :1]
-        table = table / (2 * math.pi * energy[:, None])
-        folds = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64, device=query.device)
-        along, across = frequencies[:, None, None] + folds[:, None], folds
-        pixel = torch.sinc(along * query.grid.active) * torch.sinc(across * query.grid.active)
-        if not query.grid.integrate:
-            pixel = torch.ones_like(pixel)
-        radius = torch.sqrt(along**2 + across**2) / query.pixel_pitch  # (F, 3, 3)
-        place = (length[:, None] * radius.flatten() * d / a / steps).clamp(max=count - 1)  # beyond 2 there is nothing
-        value = even_between(table, place)
-        found = (value.unflatten(-1, radius.shape) * pixel).sum((-2, -1))
-        if (edge := math.sqrt(math.prod(shape) / math.pi) * query.pixel_pitch) > reach:  # INT J0(2 pi f r) dr / r^2
-            nodes = 1 / reach + (1 / edge - 1 / reach) * (torch.arange(_TAIL, dtype=torch.float64) + 0.5) / _TAIL
-            tail = BesselJ0.apply(2 * math.pi / query.pixel_pitch * frequencies / nodes[:, None].to(query.device))
-            found = found + (rim[chosen] * (1 / reach - 1 / edge))[:, None, None] * tail.mean(0)
-        return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
-
-    return transfer
+    return RadialTransfer(
+        light=light / (4 * math.pi**2 * energy[:, None]),
+        kernel=hankel_kernel(t, count, step=2 / (count - 1)),
+        step=_TABLE_STEP / (scales * pitch),
+        kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
+        rim=rim / pitch,
+        reach=reach / pitch,
+        active=query.grid.active if query.grid.integrate else None,
+    )
 
 
 def _share_inside(shape: tuple[int, int], radius: Tensor) -> Tensor:
