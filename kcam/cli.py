@@ -35,7 +35,7 @@ app = typer.Typer(
 )
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
-TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; without it, everything'
+TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; 0: the reference physics'
 FeaturesOption = Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")]
 WeightsOption = Annotated[str, typer.Option("--vgg-weights", help="torchvision's vgg16-397923af.pth")]
 StyleSizeOption = Annotated[
@@ -203,9 +203,12 @@ def shoot(
     size: Annotated[
         int, typer.Option("--size", min=0, help="longer side [pixels]: strokes do not shrink with it; 0: as it is")
     ] = 0,
-    tolerance: Annotated[str, typer.Option("--tolerance", help=TOLERANCE)] = "",
+    tolerance: Annotated[str, typer.Option("--tolerance", help=TOLERANCE)] = "0.01",
 ) -> None:
-    """Photograph photographs: what this camera would have seen at that distance. A picture keeps its size."""
+    """Photograph photographs: what this camera would have seen at that distance. A picture keeps its size.
+
+    Of each it names the file, and in a line below what was left out.
+    """
     with one_line_errors():
         from kcam import shoot as module
 
@@ -214,20 +217,20 @@ def shoot(
             "distance": length(distance),
             "seed": seed,
             "size": size or None,
-            "tolerance": as_tolerance(tolerance) if tolerance else None,
+            "tolerance": as_tolerance(tolerance),
         }
         pairs = module.outputs(photos, out)
         failed = []
         with progress("shoot", total=len(pairs)) as advance:
             for photo, target in pairs:
                 try:
-                    module.shoot(stages, photo, target, **how)
+                    plan = module.shoot(stages, photo, target, **how)
                 except (ValueError, OSError) as error:
                     if len(pairs) == 1:
                         raise
                     failed.append(str(error) if photo.name in str(error) else f"{photo.name}: {error}")
                 else:
-                    typer.echo(target)
+                    typer.echo(f"{target}\n  {plan.summary()}")
                 advance(photo.name)
         for reason in failed:
             complain(reason)

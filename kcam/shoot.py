@@ -12,6 +12,8 @@ import torch
 
 from kcam import files, optics, plots
 from kcam.camera import Camera
+from kcam.planner import Plan
+from kcam.planner import shoot as within
 from kcam.scene import Scene
 
 
@@ -66,11 +68,13 @@ def shoot(
     distance: float,
     seed: int = 0,
     size: int | None = None,
-    tolerance: float | str | None = None,
-) -> None:
+    tolerance: float | str = 0.01,
+) -> Plan:
     """Photograph a photograph at a distance, and write the picture; the same seed gives the same bytes.
 
     Args:      size: of the longer side [pixels], to which a larger photo is shrunk first; None: as it is.
+               tolerance: of the raw, see `kcam.planner.shoot`; 0 for the reference physics.
+    Returns:   what was simulated of it.
     Raises:    ValueError for a distance that is too near, a size above the photo's, or a camera that gives no picture.
     """
     scene = replace(Scene.from_file(photo), depth=distance)  # a length with its unit, or in metres as the help says
@@ -83,13 +87,12 @@ def shoot(
         if isinstance(stage, optics.Imaging):
             check_not_too_near(stage, distance, shape=(scene.shape[1], scene.shape[2]))
     with torch.no_grad():
-        if tolerance is not None:
-            camera = camera.plan(scene, tolerance=tolerance).apply(camera)
-        picture = camera(scene, generator=torch.Generator().manual_seed(seed))
+        picture, plan = within(camera, scene, tolerance=tolerance, generator=torch.Generator().manual_seed(seed))
     if picture.shape[1] != 3:
         raise ValueError(f"the camera gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
     target.parent.mkdir(exist_ok=True)
     plots.write_picture(picture[0].clamp(0, 1), target)
+    return plan
 
 
 def check_not_too_near(imaging: optics.Imaging, distance: float, *, shape: tuple[int, int]) -> None:

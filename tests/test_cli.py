@@ -82,7 +82,9 @@ def test_version() -> None:
 @pytest.mark.parametrize("camera", ["phone", "ideal"])
 def test_shoot(camera: str, photo: Path, tmp_path: Path) -> None:
     out = tmp_path / "shot.png"
-    assert run("shoot", photo, "--camera", camera, "--out", out).strip() == str(out)
+    said, left_out = run("shoot", photo, "--camera", camera, "--out", out).splitlines()
+    assert said == str(out)
+    assert "nothing left out: all of it takes about" in left_out
     with Image.open(out) as shot:
         assert (shot.size, shot.mode) == ((56, 40), "RGB")
         first = np.asarray(shot)
@@ -106,11 +108,18 @@ def test_seed_decides_the_noise(photo: Path, tmp_path: Path) -> None:
     assert one.read_bytes() != two.read_bytes()
 
 
-def test_shoot_within_a_tolerance(photo: Path, tmp_path: Path) -> None:
-    """Planned and whole picture differ, but by less than one sees."""
+def test_shoot_within_a_tolerance(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planned and whole picture differ, but by less than one sees, and a line says in what; one that takes less time
+    than a plan is whole.
+    """
     whole, planned = tmp_path / "1.png", tmp_path / "2.png"
-    run("shoot", photo, "--camera", "thesis", "--out", whole)
-    run("shoot", photo, "--camera", "thesis", "--tolerance", "0.01", "--out", planned)
+    run("shoot", photo, "--camera", "thesis", "--tolerance", "0", "--out", whole)
+    monkeypatch.setattr("kcam.planner.planner.WORTH", math.inf)
+    run("shoot", photo, "--camera", "thesis", "--out", planned)
+    assert whole.read_bytes() == planned.read_bytes()
+    monkeypatch.setattr("kcam.planner.planner.WORTH", 0.0)
+    _, left_out = run("shoot", photo, "--camera", "thesis", "--out", planned).splitlines()
+    assert left_out.startswith("  within 0.01: wavelengths 4 PSFs (of 28 PSFs)")
     one, two = (np.asarray(Image.open(path)).astype(float) for path in (whole, planned))
     assert 0 < np.abs(one - two).max() < 12
     assert "is no relative error: expected e.g. 0.01, or sensor" in fails("shoot", photo, "--tolerance", "fine")

@@ -60,7 +60,7 @@ def styled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_one_photo_becomes_the_file(tmp_path: Path, styled: Path) -> None:
     photo = make_photo(tmp_path / "photo.jpg")
     out = tmp_path / "shot.jpg"
-    assert run("shoot", photo, "--camera", styled, "--out", out).splitlines() == [str(out)]
+    assert run("shoot", photo, "--camera", styled, "--out", out).splitlines()[0] == str(out)
     with Image.open(out) as picture:
         assert (picture.size, picture.format) == ((WIDTH, HEIGHT), "JPEG")
 
@@ -77,7 +77,7 @@ def test_one_photo_into_a_folder(tmp_path: Path, there: bool) -> None:
 def test_several_photos_become_a_folder(folder: Path, tmp_path: Path) -> None:
     shots = tmp_path / "shots"
     some = [folder / "a.jpg", folder / "c.tif"]
-    printed = run("shoot", *some, "--camera", "ideal", "--out", shots).splitlines()
+    printed = run("shoot", *some, "--camera", "ideal", "--out", shots).splitlines()[::2]
     assert printed == [str(shots / "a.png"), str(shots / "c.png")]
     assert sorted(path.name for path in shots.iterdir()) == ["a.png", "c.png"]
     assert pixels(shots / "a.png").shape == (HEIGHT, WIDTH, 3)
@@ -243,8 +243,8 @@ def test_what_cannot_be_read_stops_none_of_the_others(damaged: tuple[str, ...], 
     whole = [name for name in ("a.jpg", "b.PNG", "c.tif", "d.png") if name not in damaged]
     lines = run("shoot", folder, "--camera", "ideal", "--out", tmp_path / "shots", status=2).splitlines()
     shots = [tmp_path / "shots" / f"{name[0]}.png" for name in whole]
-    assert lines[: len(whole)] == [str(shot) for shot in shots]
-    for name, line in zip(damaged, lines[len(whole) : -1], strict=True):
+    assert lines[: 2 * len(whole) : 2] == [str(shot) for shot in shots]
+    for name, line in zip(damaged, lines[2 * len(whole) : -1], strict=True):
         assert line.startswith(f"kcam: cannot read {folder / name} as a picture")
     assert lines[-1] == f"kcam: {len(damaged)} of 4 photos could not be taken."
     for shot in shots:

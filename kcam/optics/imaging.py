@@ -27,7 +27,7 @@ from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.regions import field_shares, pixel_positions
 from kcam.optics.rendering.borders import BORDERS
-from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, layer_shares, warn_of_few
+from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, layer_shares, present, warn_of_few
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.optics.rendering.zones import Axis
@@ -168,12 +168,13 @@ class Imaging(Stage):
 
     def knowing(self, wavelengths: Tensor) -> Imaging:
         """The same stage, which keeps each PSF that it and those changed from it compute without gradients, for scenes
-        of these wavelengths, as `known`: by what this stage is now, and until it is asked again.
+        of these wavelengths, as `known`: by what it is now. What does not depend on what was asked before is kept for
+        the next that is asked for, by value.
         """
         own = self.changed()
         if not self.varies and self._positions is None:
             ends = torch.stack(wavelengths.aminmax()) if getattr(self.lens, "symmetric", False) else wavelengths[:0]
-            own.known = self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends))
+            own.known = replace(self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={})
         return own
 
     def _check_recipe(self) -> None:
@@ -385,6 +386,14 @@ class Imaging(Stage):
         present = (shares.flatten(2).amax(dim=(0, 2)) > 0).cpu()
         return vergences[present], shares[:, present.to(shares.device)]
 
+    def _present(self, scene: Scene) -> Tensor:
+        """Vergences of the layers in which there is anything."""
+        depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=scene.coefficients.device)
+        vergences = self.vergences(scene, depth)
+        if depth.ndim < 2 or vergences.numel() == 1:
+            return vergences
+        return vergences[present(1 / depth, vergences, interpolate=self.accuracy.interpolate).to(vergences.device)]
+
     def _layers_at_once(self, bands: int, window: tuple[int, int], planes: Tensor) -> int:
         """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
         return max(1, int(self.accuracy.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
@@ -403,7 +412,7 @@ class Imaging(Stage):
         if rank is not None and rank < count:
             touched = float(batch * height * width * count * (count / 8 + rank))
             first, count, factored = Work({"touch": touched}, planes.element_size() * touched / count), rank, True
-        vergences, _ = self.layers_of(scene, planes)
+        vergences = self._present(scene)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
         channels = None if layers > 1 and self.accuracy.per_band else channels

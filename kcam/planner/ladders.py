@@ -26,7 +26,7 @@ FEW_LAYERS, TAIL = 3, 16
 ORDERS = (1.0, 1.5)
 """A ladder's error falls at least with such a power of its step: one where phases jump, two where it is fine enough."""
 
-FASTEST = 3.0
+FASTEST = 2.0
 """With which power of its step no ladder's error falls."""
 
 URGENT = 10.0

@@ -122,14 +122,16 @@ class Range:
             else (),
         )
 
-    def growth(self, found: Survey, changes: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    def growth(self, found: Survey, changes: Mapping[str, Any], *, hides: bool) -> Iterator[tuple[str, float]]:
         """How many times as large the error of changes could be in a scene, for each kind of reason, in words.
+
+        hides: whether what the full well cut off of the planned scenes was left out of their errors.
 
         What differs between wavelengths and distances is foretold to the power of 2: in one scene errors cancel, or lie
         in the dark, that add up in another.
         """
         depth, relative = bool({"layers", "occlusion"} & set(changes)), found.relative().tolist()
-        hidden = max(1.0, math.sqrt((1 + self.saturated) / (1 + relative[-1])))  # errors, by the full well
+        hidden = max(1.0, math.sqrt((1 + self.saturated) / (1 + relative[-1]))) if hides else 1.0
         for kind, ours, planned in zip(KINDS, relative, self.potential, strict=True):
             if depth or kind not in OF_DEPTH:
                 yield kind, hidden * math.sqrt((ours + LEAST) / (planned + LEAST))
@@ -241,7 +243,7 @@ class Plan:
             if set(self.changes) <= WAYS and not error:
                 continue
             most = min(GROWTH, allowed / max(error, 1e-30))
-            for kind, growth in self.range.growth(found, self.changes):
+            for kind, growth in self.range.growth(found, self.changes, hides=self.checked is not None):
                 if growth > most:
                     return f"has {growth:.3g} times the {kind} planned for, where {most:.3g} times is safe"
         return None
@@ -276,6 +278,16 @@ class Plan:
 
     def __str__(self) -> str:
         return _table(self)
+
+    def summary(self) -> str:
+        """In one line, what was left out."""
+        told = [row for row in self.decisions if row.instead and row.effect not in ("convolution", "memory")]
+        fewer = [f"{row.effect} {row.chosen} (of {row.instead})" for row in told if row.chosen != "left out"]
+        without = [row.effect for row in told if row.chosen == "left out"]
+        parts = [*(fewer and [", ".join(fewer)]), *(without and [f"without {', '.join(without)}"])]
+        if not parts:
+            return f"nothing left out: all of it takes about {_time(self.seconds)}"
+        return f"within {self.allowed:.2g}: {'; '.join(parts)}"
 
 
 def _read(text: str | bytes, wrong: str) -> Plan:

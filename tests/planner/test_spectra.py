@@ -102,7 +102,7 @@ def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int)
     assert len(seen) > len(set(seen))  # some were looked at twice before they were left
 
 
-@pytest.mark.parametrize("order", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("most", [0.5, 0.03, 1e-3])
 def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> None:
     """However fast errors fall, the rung that is reached does, and no rung before it that was passed over would have."""
@@ -121,4 +121,4 @@ def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> No
     truth = counts[ladder.position] ** -order - counts[-1] ** -order
     assert ladder.at_top or truth <= 1.6 * most
     for n in set(counts[: ladder.position]) - asked:
-        assert n**-order - counts[-1] ** -order > most
+        assert n**-order - counts[-1] ** -order > 0.6 * most

@@ -48,12 +48,24 @@ def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) 
     Args:      vergence: (B, 1, H, W) [1/m]; beyond the layers all is in the last. layers: (Z,) ascending, Z > 1 [1/m].
     Returns:   (B, Z, H, W), sums to 1 over the layers.
     """
-    layers = layers.to(vergence.device)
-    before, share = bracketed(layers, vergence)
-    position = (before + share).clamp(0, layers.numel() - 1)
-    position = position if interpolate else position.round()
+    position = _positions(vergence, layers, interpolate=interpolate)
     index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
     return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
+
+
+def _positions(vergence: Tensor, layers: Tensor, *, interpolate: bool) -> Tensor:
+    before, share = bracketed(layers.to(vergence.device), vergence)
+    position = (before + share).clamp(0, layers.numel() - 1)
+    return position if interpolate else position.round()
+
+
+def present(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
+    """In which layers there is anything, (Z,) bool, without the shares. Args: as of `layer_shares`."""
+    position = _positions(vergence.detach(), layers, interpolate=interpolate).flatten()
+    found = torch.zeros(layers.numel(), dtype=torch.bool, device=position.device)
+    for one in (position.floor(), position.ceil()):
+        found[one.long()] = True
+    return found.cpu()
 
 
 def warn_of_few(layers: object, nodes: Tensor, *, vergence: Tensor, defocus_waves: float) -> None:
