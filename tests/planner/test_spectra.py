@@ -105,7 +105,7 @@ def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int)
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("most", [0.5, 0.03, 1e-3])
 def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> None:
-    """However fast errors fall, the rung that is reached does, and no rung before it that was passed over would have."""
+    """However fast errors fall, the rung that is reached does, and none that was passed over would have."""
     counts = [*even_counts(128), 128]
     asked: set[int] = set()
 
