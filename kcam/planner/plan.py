@@ -38,6 +38,11 @@ UNTRIED = 1.5
 GROWTH = 4.0
 """Times the error of the last trial, up to which a later scene's is foretold."""
 
+EACH = 50
+"""Steps of training after which it is measured whether a plan still fits what has been trained, on one scene: some per
+cent of their time.
+"""
+
 LEAST, COLOUR, DEPTH, RING, OTHER_LIGHT = 1e-6, 0.01, 0.1, 0.1, 1.5
 """Potentials, and shares of bands, distances and rings, beside which smaller ones do not count; how far those may
 differ."""
@@ -216,7 +221,7 @@ class Plan:
         known = self.trained if self.gradients else ()
         ahead = set() if known is None else {*noiseless_raw(camera).parameters()}  # by identity
         unplanned = [p for name, p in camera.named_parameters() if p in ahead and name not in (known or ())]
-        return PlannedCamera(*stages, context=stages.context, plan=self, unplanned=unplanned)
+        return PlannedCamera(*stages, context=stages.context, plan=self, whole=camera, unplanned=unplanned)
 
     def outside(self, camera: Camera, scene: Scene) -> str | None:
         """In what a scene is unlike those that were planned for, such that the error may exceed the tolerance; or None.
@@ -247,6 +252,19 @@ class Plan:
                 if growth > most:
                     return f"has {growth:.3g} times the {kind} planned for, where {most:.3g} times is safe"
         return None
+
+    def renew(self, camera: Camera, scenes: Scene | Sequence[Scene]) -> Plan:
+        """A new plan, for the camera as it is now: of the same tolerance, memory and, if it was, for training.
+
+        Args:      camera: that which this plan was made for, or a planned one, of which that is meant.
+        Raises:    as `make_plan`.
+        """
+        from kcam.planner.planner import make_plan  # which makes plans of this file
+
+        with torch.set_grad_enabled(self.gradients):
+            whole = camera.whole if isinstance(camera, PlannedCamera) else camera
+            memory = self.changes.get("max_memory")
+            return make_plan(whole, scenes, tolerance=self.tolerance, max_memory=memory)
 
     def measure(self, camera: Camera, scene: Scene, *, truth: Tensor | None = None) -> float:
         """True error of the plan: relative RMS of its noiseless raw against that of the camera without it (`truth`)."""
@@ -305,17 +323,30 @@ class OutOfRange(UserWarning):
 
 
 class PlannedCamera(Camera):
-    """A camera with a plan applied: it warns (`OutOfRange`) where a scene leaves the range that was planned for, and
-    where gradients flow that were not planned for.
+    """A camera with a plan applied: it warns (`OutOfRange`) where a scene leaves the range that was planned for, where
+    gradients flow that were not planned for, and where training has left it, which is measured each `EACH` steps.
+
+    whole: the camera without the plan, which it shares all parameters with.
 
     unplanned: parameters through whose gradients the plan's shortcuts act, and that it does not know.
     """
 
     def __init__(
-        self, *stages: nn.Module, plan: Plan, context: Context | None = None, unplanned: Sequence[nn.Parameter] = ()
+        self,
+        *stages: nn.Module,
+        plan: Plan,
+        whole: Camera,
+        context: Context | None = None,
+        unplanned: Sequence[nn.Parameter] = (),
     ) -> None:
         super().__init__(*stages, context=context)
-        self.plan_applied, self.unplanned = plan, tuple(unplanned)
+        self.plan_applied, self.unplanned, self._steps = plan, tuple(unplanned), 0
+        self._whole = (whole,)  # not a module of its own: its parameters are known already
+
+    @property
+    def whole(self) -> Camera:
+        """The camera without the plan."""
+        return self._whole[0]
 
     def steps(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Iterator[tuple[str, Tensor]]:
         """As `Camera.steps`."""
@@ -329,6 +360,16 @@ class PlannedCamera(Camera):
                 stacklevel=3,
             )
         if torch.is_grad_enabled():
+            self._steps += 1
+            if isinstance(scene, Scene) and self._steps % EACH == 0 and len(scene.coefficients):
+                error = plan.measure(self.whole, scene.samples([0]))
+                if error > plan.allowed:
+                    warnings.warn(
+                        f"after {self._steps} steps of training the plan is off by {error:.2g}, more than the tolerance "
+                        f"of {plan.allowed:g}. Plan anew for what it has become: plan.renew(camera, scenes).",
+                        OutOfRange,
+                        stacklevel=3,
+                    )
             flows = [p for p in self.unplanned if p.requires_grad]
             towards = [
                 name

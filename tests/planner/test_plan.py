@@ -508,8 +508,8 @@ def test_a_scene_out_of_range_warns() -> None:
         assert both.measure(shot, scene(32, depth=0.5)) <= 0.05
 
 
-def silent(applied: Camera, light: Scene) -> bool:
-    with torch.no_grad(), warnings.catch_warnings(record=True) as found:
+def silent(applied: Camera, light: Scene, *, training: bool = False) -> bool:
+    with torch.set_grad_enabled(training), warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         applied(light)
     return not any(issubclass(warning.category, OutOfRange) for warning in found)
@@ -695,3 +695,49 @@ def test_gradients_towards_the_scene_are_not_planned_for() -> None:
     wanted = dataclasses.replace(light, coefficients=light.coefficients.clone().requires_grad_())
     with pytest.warns(OutOfRange, match="the scene's coefficients .* Use the camera without a plan"):
         plan.apply(shot)(wanted)
+
+
+def trained(strength: float) -> Camera:
+    """A camera whose only parameter is how strong its DOE is: 0 leaves the lens in focus."""
+    strong = torch.nn.Parameter(torch.tensor([0.0, 0.0, 0.0, strength, 0.0, 0.0], dtype=torch.float64))
+    lens = optics.Lens(
+        optics.CircularAperture(2 * mm),
+        optics.PlanoConvexLens(25.8 * mm),
+        optics.ZernikeDOE(strong),
+        focus_distance=2.0,
+    )
+    return Camera(optics.Imaging(lens, pixel_pitch=4 * um), *list(camera())[1:])
+
+
+def test_training_that_leaves_its_plan_is_told_and_renews_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The blur grows beyond the window that was enough: measured on a batch, each few steps, and only then."""
+    monkeypatch.setattr(kcam.planner.plan, "EACH", 3)
+    shot = trained(0.05)
+    batch = Scene.from_rgb(torch.rand(2, 3, 40, 40, generator=torch.Generator().manual_seed(0)), depth=2.0)
+    plan = shot.plan(batch, tolerance=0.02)
+    assert plan.gradients
+    planned = plan.apply(shot)
+    assert planned.whole is shot
+    assert [name for name, _ in planned.named_parameters()] == [name for name, _ in shot.named_parameters()]
+    for _ in range(6):
+        assert silent(planned, batch, training=True)
+    with torch.no_grad():
+        next(shot.parameters()).mul_(100)
+        assert plan.measure(shot, batch) > 0.02
+    assert [silent(planned, batch, training=True) for _ in range(6)] == [True, True, False, True, True, False]
+    assert all(silent(planned, batch) for _ in range(3))  # nothing is trained here
+    for of in (shot, planned):
+        renewed = plan.renew(of, batch)
+        assert renewed.gradients
+        assert renewed.tolerance == 0.02
+        assert renewed.measure(shot, batch) <= 0.02
+    assert plan.measure(shot, batch) > 0.02  # a value: it stays what it was
+
+
+def test_a_plan_is_renewed_as_it_was_made() -> None:
+    """Without gradients, and with its memory."""
+    with torch.no_grad():
+        plan = camera().plan(scene(), tolerance="sensor", max_memory=3e7)
+    again = plan.renew(camera(), scene())
+    assert not again.gradients
+    assert (again.tolerance, again.changes) == (plan.tolerance, plan.changes)
