@@ -436,7 +436,8 @@ class Imaging(Stage):
         bank = 0.0
         if self.accuracy.blur:
             at_once = min(layers, self._layers_at_once(bands, window, planes))
-            operations |= {"bank": float(math.ceil(layers / at_once)), "psf": float(layers * groups)}
+            banks = math.ceil(layers / at_once)  # at each wavelength all layers are found together
+            operations |= {"bank": float(banks), "psf": float(banks * groups)}
             if isinstance(self.lens, Lens) and not self.varies:
                 pixels = self.pixels(window, planes)
                 operations |= self.lens.operations(Points(vergences), grouped, pixels, self.accuracy)

@@ -24,21 +24,21 @@ from kcam.units import mm, um
 
 RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.values()} | {
     "map": 1.2e-08,
-    "bank": 5e-3,
-    "psf": 6e-4,
+    "bank": 7e-3,
+    "psf": 5e-4,
     "field": 8e-2,
     "field psf": 2e-3,
     "field point": 1.5e-7,
-    "transform": 1.1e-10,
+    "transform": 9e-11,
     "product": 8e-11,
-    "touch": 1.2e-9,
+    "touch": 6e-10,
     "large": 1.6e-8,
     "layer": 1e-5,
 }
 """Kind of work -> seconds for one operation, on the machine where the defaults were measured (one core, float32).
 
 Those of the rows of `optics.PROPAGATORS`: an operation as `Propagator.cost` counts it. map: a pixel of a DOE at a
-wavelength. bank, psf: a call, and each PSF in it. field, field psf, field point: a picture over the field of a real
+wavelength. bank, psf: a call, and each wavelength in it. field, field psf, field point: a picture over the field of a real
 lens, a PSF of one of its places, and a point of what that is computed on. transform: n log2(n) of a real FFT of n
 points. product: a multiplication and addition in a convolution without FFT. touch: one pass over a number. large: a
 number of a picture of more than a megapixel, once if in tiles. layer: of depth, beside its transforms.
