@@ -156,10 +156,15 @@ MOST_NODES = 512  # nodes that one Gauss-Legendre rule has at most: they are eig
 
 @functools.lru_cache(maxsize=64)
 def legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on [-1, 1]: one rule, or panels of one rule that together resolve as much."""
+    """Gauss-Legendre nodes and weights on [-1, 1]: one rule, or panels of one rule that together resolve as much.
+
+    By scipy, of a banded matrix: numpy's full one takes a second a rule where another process keeps a core from it.
+    """
+    from scipy.special import roots_legendre  # imported late
+
     panels = math.ceil(count / MOST_NODES)
     order = count if panels == 1 else math.ceil(count / panels) + 32
-    nodes, weights = np.polynomial.legendre.leggauss(order)
+    nodes, weights = roots_legendre(order)
     centres = (2 * np.arange(panels) + 1) / panels - 1
     return (centres[:, None] + nodes / panels).ravel(), np.tile(weights / panels, panels)
 

@@ -38,8 +38,8 @@ RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.valu
 """Kind of work -> seconds for one operation, on the machine where the defaults were measured (one core, float32).
 
 Those of the rows of `optics.PROPAGATORS`: an operation as `Propagator.cost` counts it. map: a pixel of a DOE at a
-wavelength. bank, psf: a call, and each wavelength in it. field, field psf, field point: a picture over the field of a real
-lens, a PSF of one of its places, and a point of what that is computed on. transform: n log2(n) of a real FFT of n
+wavelength. bank, psf: a call, and each wavelength in it. field, field psf, field point: a picture over the field of a
+real lens, a PSF of one of its places, and a point of what that is computed on. transform: n log2(n) of a real FFT of n
 points. product: a multiplication and addition in a convolution without FFT. touch: one pass over a number. large: a
 number of a picture of more than a megapixel, once if in tiles. layer: of depth, beside its transforms.
 """

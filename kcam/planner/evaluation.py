@@ -37,7 +37,7 @@ from kcam.planner.plan import (
     with_imaging,
 )
 from kcam.planner.spectra import LINEAR, Spectra, linear
-from kcam.planner.survey import BEHIND, BEYOND, CLIPPING, KINDS, TILE, Survey, survey
+from kcam.planner.survey import BEYOND, CLIPPING, EDGES, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter
 from kcam.sensor.noise import RandomStage
@@ -45,8 +45,7 @@ from kcam.sensor.noise import RandomStage
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
 WITNESSED = 2**20  # pixels of the last trial
-MOST_HIDDEN = 0.5  # times the RMS of light behind edges of depth, that adding layers up is off by: measured, 0.3
-HARDLY = 1e-3  # of that it is not asked how much it is
+HARDLY = 1e-4  # RMS of light at edges of depth, of what is recorded, of which it is not asked what it hides
 
 
 @dataclass(frozen=True)
@@ -172,11 +171,13 @@ class Evaluator:
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """The error of what does not hide what it should: of the scene with most light behind edges of depth."""
-        behind = [float(one.relative()[BEHIND]) for one in self.items]
-        if (most := MOST_HIDDEN * math.sqrt(max(behind))) < HARDLY:
-            return most
-        worst, found = max({*self.lost}, key=behind.__getitem__), [0.0]
+        """The error of what does not hide what it should: of the scene with most light at edges of depth, and none
+        where there are none: a blur carries light there from tiles around.
+        """
+        edges = [float(one.relative()[EDGES].sum()) for one in self.items]
+        if max(edges) < HARDLY**2:
+            return 0.0
+        worst, found = max({*self.lost}, key=edges.__getitem__), [0.0]
         for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
             for rows, factor in sample.of_owners():
                 if sample.owners[rows[0]] == worst:

@@ -142,7 +142,7 @@ class Ladder:
             return
         before = self.position
         self.position += 1
-        while self.successive and before and not self.at_top and self._at_best(before) > most:
+        while self.successive and not self.at_top and self._at_best(before) > most:
             self.position += 1
         self.price(evaluator)
 
@@ -158,15 +158,15 @@ class Ladder:
         return f"{self.levels[below[0]].label} would cost {self.errors[below]:.2g}"
 
 
-def ladders(evaluator: Evaluator, scene: Scene) -> list[Ladder]:
+def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:
     """The choices that exist for a camera and a scene (the one that takes longest), of which the evaluator has then
-    seen what it needs.
+    seen what it needs; one: those that pay for a single picture.
     """
     imaging = evaluator.imaging
     if imaging is None:
         evaluator.look({})
         return []
-    view = _View(evaluator, imaging, scene)
+    view = _View(evaluator, imaging, scene, one=one)
     evaluator.look(view.beside)
     return [ladder for make in LADDERS for ladder in make(view)]
 
@@ -174,8 +174,8 @@ def ladders(evaluator: Evaluator, scene: Scene) -> list[Ladder]:
 class _View:
     """What the ladders look at."""
 
-    def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene) -> None:
-        self.imaging, self.scene = imaging, scene
+    def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene, *, one: bool) -> None:
+        self.imaging, self.scene, self.one = imaging, scene, one
         planes = imaging.working(scene)
         self.vergences, _ = imaging.layers_of(scene, planes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
@@ -268,10 +268,12 @@ def _precision(view: _View) -> Iterator[Ladder]:
 
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
-    levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in even_counts(view.bands)]
-    top = Level(f"{view.bands} PSFs", {}, view.bands)
     beside = view.few(bands=False)
-    yield Ladder("wavelengths", [*levels, top], beside, successive=not view.evaluator.tabled(beside))
+    tabled, counts = view.evaluator.tabled(beside), even_counts(view.bands)
+    if view.one and not tabled:  # what half of the PSFs would save is what it takes to find out
+        counts = [n for n in counts if 3 * n <= view.bands]
+    levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in counts]
+    yield Ladder("wavelengths", [*levels, Level(f"{view.bands} PSFs", {}, view.bands)], beside, successive=not tabled)
 
 
 def _rank(view: _View) -> Iterator[Ladder]:

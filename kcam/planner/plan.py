@@ -365,8 +365,8 @@ class PlannedCamera(Camera):
                 error = plan.measure(self.whole, scene.samples([0]))
                 if error > plan.allowed:
                     warnings.warn(
-                        f"after {self._steps} steps of training the plan is off by {error:.2g}, more than the tolerance "
-                        f"of {plan.allowed:g}. Plan anew for what it has become: plan.renew(camera, scenes).",
+                        f"after {self._steps} steps of training the plan is off by {error:.2g}, more than the "
+                        f"tolerance of {plan.allowed:g}. Plan anew for what it has become: plan.renew(camera, scenes).",
                         OutOfRange,
                         stacklevel=3,
                     )

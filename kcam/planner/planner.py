@@ -74,7 +74,7 @@ def shoot(
     Arguments and errors: as `make_plan`, and as `Camera`.
     """
     check_tolerance(tolerance)
-    planner = Planner(camera, scene)
+    planner = Planner(camera, scene, one=True)
     plan = planner.plan(tolerance if planner.prices.of({})[0] > WORTH else 0)
     stages = list(camera)
     if planner.evaluator.index is not None and planner.evaluator.imaging is not None:
@@ -86,12 +86,14 @@ def shoot(
 class Planner:
     """Plans for one camera and some scenes; what was tried for one tolerance is known for the next.
 
-    Arguments and errors: as `make_plan`.
+    Arguments and errors: as `make_plan`. one: for a single picture, so that only that is looked at which pays for it.
     """
 
-    def __init__(self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None) -> None:
+    def __init__(
+        self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None, one: bool = False
+    ) -> None:
         start = time.perf_counter()
-        self.camera = camera
+        self.camera, self.one = camera, one
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         _check_scenes(self.scenes, max_memory)
         self.evaluator = Evaluator(camera, self.scenes)
@@ -180,7 +182,7 @@ class Planner:
     def _ways(self) -> tuple[list[Ladder], list[_Skip]]:
         """All choices."""
         if self._known is None:
-            every = ladders(self.evaluator, self.prices.scene)
+            every = ladders(self.evaluator, self.prices.scene, one=self.one)
             steps = [ladder for ladder in every if ladder.always or self.prices.saves(ladder)]
             skips = [_Skip(self.camera, index, self.evaluator.signals) for index in self.evaluator.skippable()]
             self._known = steps, skips

@@ -84,7 +84,7 @@ class Spectra:
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
-        self._untabled: set[Any] = set()  # propagators
+        self._tabled: dict[Any, bool] = {}  # by propagator
         self._tables: dict[Any, _Table] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
@@ -247,18 +247,21 @@ class Spectra:
 
         Of many layers a few wavelengths have a table, else all for which PSFs may stand.
         """
-        if imaging.accuracy.propagator in self._untabled:
+        window, propagator = self._window(self.imaging, vergences), imaging.accuracy.propagator  # none is larger
+        if propagator not in self._tabled:
+            query = self._query(imaging, vergences, wavelengths, window)
+            self._tabled[propagator] = query is not None and imaging.accuracy.row(query).transfer_of is not None
+        if not self._tabled[propagator]:
             return None
         some = self._few if len(vergences) > _FEW_LAYERS else self._every
         if not set(wavelengths.tolist()) <= set(some.tolist()):
             some = torch.cat([self._every, wavelengths]).unique()
-        window = self._window(self.imaging, vergences)  # none is larger
-        key = imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
+        key = propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
             query = self._query(imaging, vergences, some, window)
             transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
-            if transfer is None:
-                self._untabled.add(imaging.accuracy.propagator)
+            if transfer is None:  # for more wavelengths another row is cheaper
+                self._tabled[propagator] = False
                 return None
             self._tables[key] = _Table(some.tolist(), transfer)
             if imaging.known is not None:
