@@ -34,6 +34,7 @@ from kcam.optics.rendering.zones import Axis
 from kcam.optics.source import Defocus, FieldPSFs, FieldSource, PixelGrid, Points, PSFSource
 from kcam.precision import full_precision
 from kcam.scene import Scene
+from kcam.threads import no_more_than_free
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
 _DEFAULT = Accuracy()
@@ -634,6 +635,7 @@ class Imaging(Stage):
             most=own.max_memory / 2,
         )
 
+    @no_more_than_free()
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
         """What a picture over the field will be off by; as it is with `forward`'s arguments. Raises: ValueError for
         optics whose PSF does not vary.
@@ -643,6 +645,7 @@ class Imaging(Stage):
         field, planes, shares = self._asked(scene, colour_filter)
         return field.explain(planes, shares)
 
+    @no_more_than_free()
     @torch.no_grad()
     def apart(self, scene: Scene, *, colour_filter: Absorber | None = None) -> int:
         """How many pixels lie between the places of a picture over the field, at least; arguments as of `explain`."""

@@ -22,6 +22,7 @@ from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, nois
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
+from kcam.threads import no_more_than_free
 
 WORTH = 0.3
 """Predicted seconds of a reference picture up to which a plan for it alone takes longer than it saves: measured."""
@@ -48,11 +49,10 @@ def make_plan(
     """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
 
     A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
-    until the sum of all errors is below the tolerance / `UNTRIED`. Where the raw is linear in the light, those follow
-    from spectra. Else (light beyond the full well, PSFs that vary over the picture, gradients, a batch with depth) they
-    are tried out, and the way goes on until a last trial is below the tolerance / `SAFETY`: the whole plan against the
-    reference, each item of each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them.
-    The way up does not depend on the tolerance: with a smaller one it goes further.
+    until the sum of all errors is below the tolerance / `UNTRIED`. Where the raw is linear in the light but for the
+    full well, those follow from spectra. Else (PSFs that vary over the picture, gradients) they are tried out, and the
+    way goes on until a last trial is below the tolerance / `SAFETY`: the whole plan against the reference, each item of
+    each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them.
 
     Args:      scenes: one or several, of the same wavelengths.
                tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this
@@ -69,13 +69,15 @@ def shoot(
     camera: Camera, scene: Scene, *, tolerance: float | str, generator: torch.Generator | None = None
 ) -> tuple[torch.Tensor, Plan]:
     """One picture within a tolerance, and the plan for it, made and used where that pays: with the PSFs that making it
-    took, and with the reference physics where all of it takes less than a plan (`WORTH`).
+    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and where optics vary over the
+    picture, whose choices are tried out.
 
     Arguments and errors: as `make_plan`, and as `Camera`.
     """
     check_tolerance(tolerance)
     planner = Planner(camera, scene, one=True)
-    plan = planner.plan(tolerance if planner.prices.of({})[0] > WORTH else 0)
+    pays = planner.prices.of({})[0] > WORTH and not planner.evaluator.varies
+    plan = planner.plan(tolerance if pays else 0)
     stages = list(camera)
     if planner.evaluator.index is not None and planner.evaluator.imaging is not None:
         stages[planner.evaluator.index] = planner.evaluator.imaging
@@ -89,6 +91,7 @@ class Planner:
     Arguments and errors: as `make_plan`. one: for a single picture, so that only that is looked at which pays for it.
     """
 
+    @no_more_than_free()
     def __init__(
         self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None, one: bool = False
     ) -> None:
@@ -98,11 +101,12 @@ class Planner:
         _check_scenes(self.scenes, max_memory)
         self.evaluator = Evaluator(camera, self.scenes)
         always = {} if max_memory is None else {"max_memory": float(max_memory)}
-        self.prices = _Prices(camera, self.evaluator, self.scenes, always)
+        self.prices = _Prices(camera, self.evaluator, self.scenes, always, one=one)
         self._checked: dict[tuple[Any, ...], float] = {}
         self._known: tuple[list[Ladder], list[_Skip]] | None = None
         self._setup = time.perf_counter() - start
 
+    @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:
         """The plan for a tolerance."""
         start = time.perf_counter()
@@ -320,9 +324,11 @@ def _skipped(skips: Sequence[_Skip], allowed: float, noise: float | None) -> lis
 class _Prices:
     """Predicted time and memory of the raw of the scene that takes longest."""
 
-    def __init__(self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any]) -> None:
+    def __init__(
+        self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any], *, one: bool
+    ) -> None:
         self.imaging, self.always = evaluator.imaging, always
-        self.apart = evaluator.apart if evaluator.varies and evaluator.samples else None
+        self.apart = evaluator.apart if evaluator.varies and evaluator.samples and not one else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
