@@ -25,6 +25,7 @@ from kcam.optics.compound.tracing import Rays, system_matrix, trace
 from kcam.optics.elements.element import check_numbers, place_sensor
 from kcam.optics.numerics import Scalar, float64, phasor, squared
 from kcam.optics.source import Defocus, PixelGrid, Points
+from kcam.threads import no_more_than_free
 from kcam.units import check_distances, check_pixel_pitch, check_positive, wavelength_grid
 
 if TYPE_CHECKING:
@@ -291,6 +292,7 @@ class CompoundLens(nn.Module):
         t = float64(self.sensor_distance).to(rays.x.device) / rays.dz
         return replace(rays, x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, path=rays.path + t)
 
+    @no_more_than_free()
     def opd(
         self,
         wavelengths: Tensor | list[float],
@@ -381,6 +383,7 @@ class CompoundLens(nn.Module):
         ideal = landed[0] / near[0] * asked.heights
         return torch.where(asked.heights > 0, landed[1:] / torch.where(ideal == 0, 1.0, ideal) - 1, 0.0)
 
+    @no_more_than_free()
     def psf(
         self,
         wavelengths: Tensor | list[float],
@@ -437,6 +440,7 @@ class CompoundLens(nn.Module):
             area = areas(fitted, Frame.upright(fitted))
         return float(area) * float(self.sensor_distance) ** 2
 
+    @no_more_than_free()
     def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
         """PSFs (N, L, h, w) of source points, on the axis unless they have positions: see `PSFSource`."""
         places = torch.zeros(len(points.vergences), 2) if points.positions is None else points.positions
@@ -498,6 +502,7 @@ class CompoundLens(nn.Module):
         over_radius = Even.through(heights / radii, radii, reach=float(radii.detach().max()))
         return ImageHeights(over_radius, scale)
 
+    @no_more_than_free()
     def over_field(self, reach: float, vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """PSFs of all places up to `reach` from the axis [m], for points at vergences (Z,) [1/m] and wavelengths (L,)
         [m].
@@ -527,6 +532,7 @@ class CompoundLens(nn.Module):
 
     # ---- analysis --------------------------------------------------------------------------------------------------
 
+    @no_more_than_free()
     def mtf(
         self,
         wavelengths: Tensor | list[float],
@@ -571,6 +577,7 @@ class CompoundLens(nn.Module):
             found = found * rows[:, None] * columns
         return (found if field is not None else found[0]).to(dtype)
 
+    @no_more_than_free()
     def modulation(
         self,
         frequencies: Tensor | Sequence[float],
@@ -611,6 +618,7 @@ class CompoundLens(nn.Module):
         # a floor far below rounding: no NaN gradient at the zeros of an MTF
         return torch.sqrt(squared(torch.stack(found)) + torch.finfo(torch.float64).tiny)
 
+    @no_more_than_free()
     def spots(
         self,
         wavelengths: Tensor | list[float],
@@ -631,6 +639,7 @@ class CompoundLens(nn.Module):
         points, _, weights = self._landed(asked, rings)
         return (points, weights) if field is not None else (points[0], weights[0])
 
+    @no_more_than_free()
     def refocus(
         self,
         criterion: str = "rms",
@@ -681,6 +690,7 @@ class CompoundLens(nn.Module):
         del arguments["surfaces"]
         return type(self)(*self.surfaces, **arguments)  # type: ignore[arg-type]
 
+    @no_more_than_free()
     def field_limit(self, *, least: float = 0.2, distance: float = math.inf) -> float:
         """Largest height Y / D up to which the relative illumination is above `least` and chief rays pass: by nested
         intervals of the angle, to 0.001 degrees; that of 60 degrees where they do so up to there.
@@ -702,6 +712,7 @@ class CompoundLens(nn.Module):
                 low, high = float(angles[max(first - 1, 0)]), float(angles[first])
         return math.tan(low)
 
+    @no_more_than_free()
     def field_curves(
         self,
         heights: Tensor | list[float] | None = None,
