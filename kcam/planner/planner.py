@@ -24,7 +24,7 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH = 0.3
+WORTH = 0.5
 """Predicted seconds of a reference picture up to which a plan for it alone takes longer than it saves: measured."""
 
 SENSOR = "sensor"
@@ -69,15 +69,14 @@ def shoot(
     camera: Camera, scene: Scene, *, tolerance: float | str, generator: torch.Generator | None = None
 ) -> tuple[torch.Tensor, Plan]:
     """One picture within a tolerance, and the plan for it, made and used where that pays: with the PSFs that making it
-    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and where optics vary over the
-    picture, whose choices are tried out.
+    took. It is the reference where all of that takes less than a plan: up to `WORTH`, where optics vary over the
+    picture, whose choices are tried out, and where rings of a profile scatter light far, which takes long to follow.
 
     Arguments and errors: as `make_plan`, and as `Camera`.
     """
     check_tolerance(tolerance)
     planner = Planner(camera, scene, one=True)
-    pays = planner.prices.of({})[0] > WORTH and not planner.evaluator.varies
-    plan = planner.plan(tolerance if pays else 0)
+    plan = planner.plan(tolerance if planner.pays else 0)
     stages = list(camera)
     if planner.evaluator.index is not None and planner.evaluator.imaging is not None:
         stages[planner.evaluator.index] = planner.evaluator.imaging
@@ -105,6 +104,14 @@ class Planner:
         self._checked: dict[tuple[Any, ...], float] = {}
         self._known: tuple[list[Ladder], list[_Skip]] | None = None
         self._setup = time.perf_counter() - start
+
+    @property
+    def pays(self) -> bool:
+        """Whether a plan for a single picture takes less time than it saves: see `shoot`."""
+        imaging = self.evaluator.imaging
+        if imaging is None or self.evaluator.varies or getattr(imaging.lens, "has_rings", False):
+            return False
+        return self.prices.of({})[0] > WORTH
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:
