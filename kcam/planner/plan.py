@@ -481,12 +481,13 @@ def _summary(plan: Plan) -> list[str]:
         text += f" The last trial found {plan.checked:.2g}."
     if plan.reference_seconds > 0:
         share = plan.planning_seconds / plan.reference_seconds
+        late = plan.planning_seconds + plan.seconds > plan.reference_seconds
         text += (
             f" Time of the raw {_time(plan.seconds)} instead of {_time(plan.reference_seconds)}, "
             f"{plan.reference_seconds / max(plan.seconds, 1e-9):.3g} times as fast; memory {plan.memory / 1e6:.0f} MB "
             f"instead of {plan.reference_memory / 1e6:.0f}. Planning took {_time(plan.planning_seconds)}, "
             f"{share:.0%} of the reference's predicted time"
-            + (": it pays for several pictures, not for one." if share > 0.1 else ".")
+            + (": it pays for several pictures, not for one." if late else ": it pays at the first picture.")
         )
     else:
         text += " The camera has no optics to simplify."
