@@ -386,9 +386,7 @@ def test_bessel_functions_can_be_differentiated_again() -> None:
 
 @pytest.mark.parametrize("profile", [None, noise(12, 1.0)], ids=["bare", "rings"])
 @pytest.mark.parametrize("aperture", ["circle", "annulus"])
-def test_the_second_derivative_of_the_radial_row_is_that_of_differences(
-    aperture: str, profile: Tensor | None
-) -> None:
+def test_the_second_derivative_of_the_radial_row_is_that_of_differences(aperture: str, profile: Tensor | None) -> None:
     weights = torch.rand(9, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def slope(distance: float, *, graph: bool = False) -> tuple[Tensor, Tensor]:
