@@ -549,7 +549,7 @@ def test_nearly_all_later_scenes_are_inside_the_tolerance_or_out_of_range() -> N
     like, left = later_campaign(range(40, 70), scenes=8)
     assert len(like) > 100
     assert sum(like) <= 0.1 * len(like)
-    assert len(left) >= 20
+    assert len(left) >= 10  # plans by spectra keep a distance: of 480 pictures fewer leave than did
     assert sum(map(bool, left)) <= 0.05 * len(left)
     assert max(left) < 5
 
