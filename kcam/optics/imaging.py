@@ -384,8 +384,8 @@ class Imaging(Stage):
         if vergences.numel() == 1:
             return vergences, None
         shares = layer_shares(1 / depth, vergences, interpolate=self.accuracy.interpolate).to(planes)
-        present = (shares.flatten(2).amax(dim=(0, 2)) > 0).cpu()
-        return vergences[present], shares[:, present.to(shares.device)]
+        filled = present(1 / depth, vergences, interpolate=self.accuracy.interpolate)
+        return vergences[filled.to(vergences.device)], shares[:, filled.to(shares.device)]
 
     def _present(self, scene: Scene) -> Tensor:
         """Vergences of the layers in which there is anything."""

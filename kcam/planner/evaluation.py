@@ -99,13 +99,21 @@ class Evaluator:
         full = [scene for scene in scenes if scene.coefficients.numel()]
         self.surveys = [survey(scene, self.raw_camera, self.defocus) for scene in full]
         self.varies = self.imaging is not None and self.imaging.varies
-        # over the field a whole picture takes fewer PSFs than its crops: places mirror each other
-        self.samples = _samples(full, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
-        self.witnesses = _samples(full, self.surveys, pixels=WITNESSED)
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
         self.scenes = full
         self.signals: list[dict[int, tuple[Tensor, Context]]] = []
         self.spectra: list[Spectra] | None = None
+
+    @functools.cached_property
+    def samples(self) -> list[Sample]:
+        """What choices are tried on."""
+        # over the field a whole picture takes fewer PSFs than its crops: places mirror each other
+        return _samples(self.scenes, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
+
+    @functools.cached_property
+    def witnesses(self) -> list[Sample]:
+        """What a finished plan is tried on."""
+        return _samples(self.scenes, self.surveys, pixels=WITNESSED)
 
     def look(self, settings: Mapping[str, Any]) -> None:
         """See what the stages of the sensor are given, with about these optics, and whether spectra tell what choices

@@ -250,9 +250,12 @@ class Spectra:
         window, propagator = self._window(self.imaging, vergences), imaging.accuracy.propagator  # none is larger
         if propagator not in self._tabled:
             query = self._query(imaging, vergences, wavelengths, window)
-            known = query is not None and imaging.accuracy.row(query).transfer_of is not None
             # in the mean over directions a window that cuts rays off is not what it is; rings reach far with little
-            self._tabled[propagator] = known and (self.fits or (query is not None and query.has_rings))
+            self._tabled[propagator] = (
+                query is not None
+                and imaging.accuracy.row(query).transfer_of is not None
+                and (self.fits or query.has_rings)
+            )
         if not self._tabled[propagator]:
             return None
         some = self._few if len(vergences) > _FEW_LAYERS else self._every
