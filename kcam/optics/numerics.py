@@ -47,13 +47,22 @@ def squared(field: Tensor) -> Tensor:
     return field.real.square() + field.imag.square()
 
 
+def _bessel(order: int, x: Tensor) -> Tensor:
+    """J0 or J1. On a CPU by scipy in as much time: torch's are off by 4e-7 at x = 5."""
+    if x.device.type != "cpu" or x.dtype != torch.float64:
+        return (torch.special.bessel_j0, torch.special.bessel_j1)[order](x)
+    from scipy.special import j0, j1  # imported late
+
+    return torch.as_tensor((j0, j1)[order](x.detach().numpy()))
+
+
 class BesselJ0(torch.autograd.Function):
     """J0 with its derivative -J1, which torch.special leaves out without a word; any number of times."""
 
     @staticmethod
     def forward(ctx, x):
         ctx.save_for_backward(x)
-        return torch.special.bessel_j0(x)
+        return _bessel(0, x)
 
     @staticmethod
     def backward(ctx, grad):
@@ -67,7 +76,7 @@ class BesselJ1(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x):
         ctx.save_for_backward(x)
-        return torch.special.bessel_j1(x)
+        return _bessel(1, x)
 
     @staticmethod
     def backward(ctx, grad):
