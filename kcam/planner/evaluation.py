@@ -119,7 +119,7 @@ class Evaluator:
         """See what the stages of the sensor are given, with about these optics, and whether spectra tell what choices
         cost: where the raw is linear in the light, but for what the full well cuts off.
         """
-        few = {**settings, "bands": 1}
+        few = {**settings, "bands": 1, "occlusion": False}  # it moves little of the light, and takes half of the time
         if "layers" in few and not any(bool(one.potential[BEYOND].any()) for one in self.items):
             few["layers"] = 1
         self.signals = self._signals(few)

@@ -109,7 +109,7 @@ class Planner:
     def pays(self) -> bool:
         """Whether a plan for a single picture takes less time than it saves: see `shoot`."""
         imaging = self.evaluator.imaging
-        if imaging is None or self.evaluator.varies or getattr(imaging.lens, "has_rings", False):
+        if imaging is None or self.evaluator.varies:
             return False
         return self.prices.of({})[0] > WORTH
 
