@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
+from itertools import accumulate
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -89,13 +91,13 @@ class BesselJ1(torch.autograd.Function):
 
 def lagrange(offset: Any, *, taps: range) -> list[Any]:
     """Weights of the Lagrange polynomial through the taps at `offset`, a tensor or an array."""
+    off = [offset - tap for tap in taps]
+    below, above = list(accumulate(off, mul)), list(accumulate(reversed(off), mul))
     weights = []
-    for tap in taps:
-        weight = 1.0
-        for other in taps:
-            if other != tap:
-                weight = weight * (offset - other) / (tap - other)
-        weights.append(weight)
+    for index, tap in enumerate(taps):
+        scale = 1 / math.prod(tap - other for other in taps if other != tap)
+        others = [*below[index - 1 : index], *above[len(off) - 2 - index : len(off) - 1 - index]]
+        weights.append(math.prod(others, start=scale))
     return weights
 
 

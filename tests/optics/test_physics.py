@@ -504,7 +504,11 @@ def test_windows_that_are_not_square_are_crops() -> None:
             rows, columns = (slice(20 - n // 2, 20 - n // 2 + n) for n in shape)
             part = singlet().psf([WAVELENGTH], shape=shape, **arguments)
             assert part.shape[-2:] == shape
-            assert (part - whole[..., rows, columns]).abs().max() < 1e-12
+            off = (part - whole[..., rows, columns]).abs()
+            if method == "radial":  # it evaluates what lies around the window, the others a square around it
+                assert off.sum() < 2e-4 * part.sum()
+            else:
+                assert off.max() < 1e-12
 
 
 @pytest.mark.parametrize("method", ["matrix", "radial"])

@@ -46,11 +46,12 @@ class Pixels:
         return image[..., top : top + self.shape[0], left : left + self.shape[1]]
 
     def of_quadrant(self, quadrant: Tensor) -> Tensor:
-        """(..., H, W) of an intensity that is even in x and y, given for x, y >= 0: (..., K + 1, K + 1)."""
+        """(..., H, W) of an intensity that is even in x and y, given for x, y >= 0: (..., J + 1, K + 1)."""
         own = [abs(i - n // 2) for n in self.shape for i in range(n)]  # which pixel of the quadrant each one repeats
         pixels = quadrant
         if self.integrate:
-            even = (2 * _halves(n, **self._how(quadrant.shape[-1] - 1, quadrant))[0] for n in self.shape)
+            reaches = (length - 1 for length in quadrant.shape[-2:])
+            even = (2 * _halves(n, **self._how(k, quadrant))[0] for n, k in zip(self.shape, reaches, strict=True))
             pixels = apply_linear(quadrant, _Products(*even))
         height = self.shape[0]
         return self._scaled(pixels[..., own[:height], :][..., own[height:]], lambda same: same.of_quadrant(quadrant))

@@ -140,7 +140,13 @@ class Query:
     @property
     def half_pixels(self) -> int:
         """Pixels from the origin to the edge of what is evaluated."""
-        return max(self.shape) // 2 + (sampling.WINDOW_MARGIN if self.grid.integrate else 0)
+        return max(self.half_sides)
+
+    @property
+    def half_sides(self) -> tuple[int, int]:
+        """The same of rows, and of columns."""
+        margin = sampling.WINDOW_MARGIN if self.grid.integrate else 0
+        return self.shape[0] // 2 + margin, self.shape[1] // 2 + margin
 
     def evaluation_grid(self, wavelength: float) -> tuple[float, int]:
         """(points per pixel, points from the origin to the edge) at which the intensity of a wavelength is

@@ -64,7 +64,7 @@ def radial_psf(query: Query) -> Tensor:
 
 
 def _corner(query: Query) -> float:
-    return math.sqrt(2) * query.half_window
+    return math.hypot(*query.half_sides) * query.pixel_pitch
 
 
 def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Tensor]:
@@ -257,8 +257,9 @@ def ring_amplitude(query: Query, pupil: Pupil, quadrature: Tensor) -> tuple[Tens
 
 def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: float) -> Tensor:
     """Intensity on the pixels from the tabulated transform (2, Z, T) of one wavelength."""
-    per_pixel, reach = query.evaluation_grid(wavelength)
-    radii2, inverse = _lattice(reach, query.device)
+    per_pixel, _ = query.evaluation_grid(wavelength)
+    reaches = [math.ceil(per_pixel * half) for half in query.half_sides]
+    radii2, inverse = _lattice(*reaches, query.device)
     position = scale * torch.sqrt(radii2) * (query.pixel_pitch / per_pixel) / _TABLE_STEP
     low = torch.clamp(position.detach().floor().long() - 3, max=transformed.shape[-1] - 8)
     offset = position - low
@@ -266,16 +267,18 @@ def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: fl
     for tap, weight in enumerate(lagrange(offset, taps=range(8))):
         value = value + weight * transformed[..., torch.abs(low + tap)]  # U is even in t
     intensity = value.square().sum(0).to(query.dtype)  # (Z, radii)
-    return query.pixels(per_pixel).of_quadrant(intensity[:, inverse].view(-1, reach + 1, reach + 1))
+    return query.pixels(per_pixel).of_quadrant(intensity[:, inverse].unflatten(-1, [reach + 1 for reach in reaches]))
 
 
 @functools.lru_cache(maxsize=8)
 @torch.inference_mode(False)
-def _lattice(reach: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _lattice(rows: int, columns: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Distinct squared radii of the grid points in one quadrant, and where each point finds its own."""
-    squares = torch.arange(reach + 1, device=device) ** 2
-    distinct, inverse = torch.unique(squares[:, None] + squares, return_inverse=True)
-    return distinct.to(torch.float64), inverse.flatten()
+    y, x = (torch.arange(reach + 1, device=device) ** 2 for reach in (rows, columns))
+    squares = (y[:, None] + x).flatten()
+    there = torch.zeros(int(squares[-1]) + 1, dtype=torch.bool, device=device)
+    there[squares] = True
+    return there.nonzero()[:, 0].to(torch.float64), (there.cumsum(0) - 1)[squares]
 
 
 def _error(query: Query) -> float:
@@ -285,7 +288,8 @@ def _error(query: Query) -> float:
 
 def lookup_cost(query: Query) -> float:
     """Operations of 40 for each point at which the intensity is evaluated."""
-    return query.vergences.numel() * sum(40.0 * m * m for m in query.points_per_axis)
+    rows, columns = (half / query.half_pixels for half in query.half_sides)
+    return query.vergences.numel() * sum(40.0 * m * m * rows * columns for m in query.points_per_axis)
 
 
 def _needs_symmetry(query: Query) -> str | None:
