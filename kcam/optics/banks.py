@@ -35,11 +35,13 @@ class KnownPSFs:
     which asks for the same ones again and again; up to `KEPT` bytes.
 
     ends: wavelengths (2,) that are computed with those asked for, so that any part of a spectrum is computed alike.
-    psfs: (h, w), by all that they depend on. others: what else is known of the same optics, see `keep`.
+    psfs: (h, w), by all that they depend on. windows: by what was asked. others: what else is known of the same optics,
+    see `keep`.
     """
 
     ends: Tensor
     psfs: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
+    windows: dict[tuple[object, ...], tuple[int, int]] = field(default_factory=dict, repr=False)
     others: dict[tuple[object, ...], Any] = field(default_factory=dict, repr=False)
 
     def bank(self, how: object, vergences: Tensor, wavelengths: Tensor, pixels: PixelGrid, compute: OnAxis) -> Tensor:
@@ -58,6 +60,15 @@ class KnownPSFs:
         return torch.stack(
             [torch.stack([_middle(self.psfs[row, column], pixels.shape) for column in columns]) for row in rows]
         )
+
+    def window(
+        self, vergences: Tensor, wavelengths: Tensor, pixels: PixelGrid, compute: Callable[[], tuple[int, int]]
+    ) -> tuple[int, int]:
+        """The window of PSFs, as `PSFSource` tells it."""
+        key = tuple(vergences.tolist()), tuple(wavelengths.tolist()), pixels
+        if key not in self.windows:
+            self.windows[key] = compute()
+        return self.windows[key]
 
     def keep(self, key: tuple[object, ...], value: Any) -> None:
         """Know a dataclass of tensors too, while all of these are together below `KEPT` bytes."""

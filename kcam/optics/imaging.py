@@ -39,6 +39,7 @@ from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
 _DEFAULT = Accuracy()
 _SETTINGS = _DEFAULT.settings().keys()
+_SHORTCUTS = _SETTINGS - {field.name for field in fields(Recipe)}
 _FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
 _TRACED = 4  # lenses, at some vergences and wavelengths, whose pupils are kept
 _FEW_COLOURS, _COLOURS = 5, 12  # PSFs of more wavelengths are polynomials of those of some: that many, about
@@ -153,12 +154,26 @@ class Imaging(Stage):
 
         Of layers that are changed here no warning says that they are few: a plan has weighed what they cost.
         """
-        changed = Imaging(**(self.configuration() | arguments))
+        if arguments.keys() <= _SHORTCUTS:
+            changed = self._with(replace(self.accuracy, **arguments))
+        else:
+            changed = Imaging(**(self.configuration() | arguments))
         changed._warns = self._warns and "layers" not in arguments
         changed._traced_cache, changed._window_cache = self._traced_cache, self._window_cache
         changed._reach, changed.known = self._reach, self.known
         if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
             changed._field_cache = self._field_cache
+        return changed
+
+    def _with(self, accuracy: Accuracy) -> Imaging:
+        """The same stage with shortcuts that no recipe is asked about, which has kept nothing."""
+        changed = Imaging.__new__(Imaging)
+        super(Imaging, changed).__init__()
+        vars(changed).update({name: value for name, value in vars(self).items() if name not in vars(changed)})
+        changed._modules = dict(self._modules)
+        for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache"):
+            setattr(changed, name, ValueCache())
+        changed.accuracy = accuracy
         return changed
 
     def fresh(self) -> Imaging:
@@ -175,7 +190,7 @@ class Imaging(Stage):
         own = self.changed()
         if not self.varies and self._positions is None:
             ends = torch.stack(wavelengths.aminmax()) if getattr(self.lens, "symmetric", False) else wavelengths[:0]
-            own.known = replace(self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={})
+            own.known = replace(self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={}, windows={})
         return own
 
     def _check_recipe(self) -> None:
@@ -232,9 +247,11 @@ class Imaging(Stage):
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
         if not self.varies:
-            key = (self.lens, vergences, wavelengths, pixels)
-            own = self._window_cache.get(key, lambda: self.lens.window(Points(vergences), wavelengths, pixels))
-            return _within(own, picture)
+            asked = (vergences, wavelengths, pixels)
+            find = functools.partial(self.lens.window, Points(vergences), wavelengths, pixels)
+            if self.known is None:
+                return _within(self._window_cache.get((self.lens, *asked), find), picture)
+            return _within(self.known.window(*asked, find), picture)
         return _within(self._traced(picture, vergences, wavelengths).window(pixels), picture)
 
     def depth_layers(self, depth: Tensor, wavelengths: Tensor, *, waves: float = LAYER_WAVES) -> Tensor:
@@ -387,7 +404,7 @@ class Imaging(Stage):
         filled = present(1 / depth, vergences, interpolate=self.accuracy.interpolate)
         return vergences[filled.to(vergences.device)], shares[:, filled.to(shares.device)]
 
-    def _present(self, scene: Scene) -> Tensor:
+    def filled(self, scene: Scene) -> Tensor:
         """Vergences of the layers in which there is anything."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=scene.coefficients.device)
         vergences = self.vergences(scene, depth)
@@ -399,9 +416,12 @@ class Imaging(Stage):
         """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
         return max(1, int(self.accuracy.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
 
-    def work(self, scene: Scene, *, channels: int | None = None, apart: int | None = None) -> Work:
+    def work(
+        self, scene: Scene, *, channels: int | None = None, apart: int | None = None, vergences: Tensor | None = None
+    ) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands. A lens
         has been traced over its field; apart: pixels between places where `spacing` leaves that to the scene, if known.
+        vergences: of the layers in which there is anything, if known.
         """
         if len(groups_of := alike(scene)) > 1:
             works = [self.work(scene.samples(rows), channels=channels, apart=apart) for rows in groups_of]
@@ -413,7 +433,7 @@ class Imaging(Stage):
         if rank is not None and rank < count:
             touched = float(batch * height * width * count * (count / 8 + rank))
             first, count, factored = Work({"touch": touched}, planes.element_size() * touched / count), rank, True
-        vergences = self._present(scene)
+        vergences = self.filled(scene) if vergences is None else vergences
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
         channels = None if layers > 1 and self.accuracy.per_band else channels

@@ -55,7 +55,7 @@ class Ladder:
     blurs: whether it only matters where there is blur.
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers.
-    always: whether it is told of and climbed also where its foot saves no time; urgency: how much more its error counts
+    always: whether it is told of and climbed without asking whether its foot saves time; urgency: how much more its error counts
     than others' where the next ladder to climb is chosen.
     """
 
@@ -233,7 +233,7 @@ def _blur(view: _View) -> Iterator[Ladder]:
     levels = [Level("none", {"blur": False}), Level(label, {})]
     if view.trained:
         levels = levels[1:]  # a parameter of the lens that trains acts through it
-    yield Ladder("diffraction", levels, view.beside, blurs=False)
+    yield Ladder("diffraction", levels, view.beside, blurs=False, always=True)
 
 
 def _model(view: _View) -> Iterator[Ladder]:
@@ -273,7 +273,8 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     if view.one and not tabled:  # what half of the PSFs would save is what it takes to find out
         counts = [n for n in counts if 3 * n <= view.bands]
     levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in counts]
-    yield Ladder("wavelengths", [*levels, Level(f"{view.bands} PSFs", {}, view.bands)], beside, successive=not tabled)
+    top = Level(f"{view.bands} PSFs", {}, view.bands)
+    yield Ladder("wavelengths", [*levels, top], beside, successive=not tabled, always=True)
 
 
 def _rank(view: _View) -> Iterator[Ladder]:
@@ -292,11 +293,11 @@ def _depth(view: _View) -> Iterator[Ladder]:
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in LAYERS if n < view.layers]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=False)
-    layers = Ladder("depth", [*levels, top], beside, successive=True)
+    layers = Ladder("depth", [*levels, top], beside, successive=True, always=True)
     yield layers
     if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
-        yield Ladder("occlusion", levels, beside, follows=layers)
+        yield Ladder("occlusion", levels, beside, follows=layers, always=True)
 
 
 def _support(view: _View) -> Iterator[Ladder]:
@@ -312,7 +313,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled)
+    yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled, always=True)
 
 
 def _field(view: _View) -> Iterator[Ladder]:

@@ -339,8 +339,10 @@ class _Prices:
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
+        self.filled: dict[tuple[Any, ...], torch.Tensor] = {}
         self.scene = scenes[0]
-        self.scene = max(scenes, key=lambda scene: self._seconds(scene))
+        if len(scenes) > 1:
+            self.scene = max(scenes, key=lambda scene: self._seconds(scene))
 
     @staticmethod
     def _channels(camera: Camera, scene: Scene) -> int | None:
@@ -355,7 +357,11 @@ class _Prices:
     def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
         if self.imaging is None:
             return Work()
-        return self.imaging.changed(**self.always | dict(changes)).work(scene, channels=self.channels, apart=self.apart)
+        imaging, vergences = self.imaging.changed(**self.always | dict(changes)), None
+        if torch.as_tensor(scene.depth).ndim != 1:  # else each distance is a picture of its own
+            key = id(scene), imaging.layers, imaging.interpolate, imaging.blur
+            vergences = self.filled[key] = self.filled[key] if key in self.filled else imaging.filled(scene)
+        return imaging.work(scene, channels=self.channels, apart=self.apart, vergences=vergences)
 
     def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
         """(seconds, bytes) with changes of the Imaging."""
