@@ -37,7 +37,7 @@ from kcam.planner.plan import (
     with_imaging,
 )
 from kcam.planner.spectra import LINEAR, Spectra, linear
-from kcam.planner.survey import BEYOND, CLIPPING, EDGES, KINDS, TILE, Survey, survey
+from kcam.planner.survey import BEHIND, BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter
 from kcam.sensor.noise import RandomStage
@@ -45,7 +45,7 @@ from kcam.sensor.noise import RandomStage
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
 WITNESSED = 2**20  # pixels of the last trial
-HARDLY = 1e-4  # RMS of light at edges of depth, of what is recorded, of which it is not asked what it hides
+HARDLY = 3e-3  # RMS of light behind edges of depth, of what is recorded, that is taken for what it changes at most
 
 
 @dataclass(frozen=True)
@@ -179,13 +179,13 @@ class Evaluator:
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """The error of what does not hide what it should: of the scene with most light at edges of depth, and none
-        where there are none: a blur carries light there from tiles around.
+        """The error of what does not hide what it should: of the scene with most light behind edges of depth, and at most
+        that light where there is hardly any.
         """
-        edges = [float(one.relative()[EDGES].sum()) for one in self.items]
-        if max(edges) < HARDLY**2:
-            return 0.0
-        worst, found = max({*self.lost}, key=edges.__getitem__), [0.0]
+        behind = [float(one.relative()[BEHIND].sqrt()) for one in self.items]
+        if max(behind) < HARDLY:
+            return max(behind)
+        worst, found = max({*self.lost}, key=behind.__getitem__), [0.0]
         for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
             for rows, factor in sample.of_owners():
                 if sample.owners[rows[0]] == worst:
@@ -200,7 +200,7 @@ class Evaluator:
 
     @functools.cached_property
     def _always(self) -> dict[str, Any]:
-        """Changes under which each trial is made: where optics vary the places are those of the reference, found once
+        """Changes under which crops are tried: where optics vary the places are about those of the reference, found once
         on the whole scenes.
         """
         if self.imaging is None or not self.varies:
@@ -226,7 +226,7 @@ class Evaluator:
 
     def _answer(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Answer:
         with torch.set_grad_enabled(self.gradients):
-            raw = self._raw(sample, self._always | dict(changes), skipped)
+            raw = self._raw(sample, changes, skipped)
             if not self.gradients or not raw.requires_grad:
                 return Answer(raw.detach(), tuple(torch.zeros_like(p) for p in self.parameters if self.gradients))
             with torch.no_grad():
@@ -237,10 +237,9 @@ class Evaluator:
         return Answer(raw.detach(), tuple(torch.zeros_like(p) if g is None else g for g, p in pairs))
 
     def _raw(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Tensor:
-        camera = self._with(changes, skipped)
         if sample.places is None or not (self.imaging and self.imaging.changed(**changes).varies):
-            return camera(sample.scene)
-        scene, reach, given = sample.scene, self.imaging.reach(sample.picture), dict(changes)
+            return self._with(changes, skipped)(sample.scene)
+        scene, reach, given = sample.scene, self.imaging.reach(sample.picture), self._always | dict(changes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         if depth.ndim > 1:  # layers lie where they lie in the whole
             own = self.imaging.changed(**given)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -344,6 +344,9 @@ def _field(view: _View) -> Iterator[Ladder]:
         Level(f"{rows} x {columns} places", {"spacing": apart}, rows * columns)
         for (rows, columns), apart in counts.items()
     ]
+    rows, columns = own
+    top = Level("places as the scene asks", {}, rows * columns + 1)
+    levels = [*levels, top] if imaging.accuracy.spacing is None else [*levels[:-1], replace(levels[-1], changes={})]
     foot = [] if view.trained else [Level("1 PSF", {"field_variation": False}, 1)]
     if not imaging.accuracy.field_variation:
         levels, foot = [Level("1 PSF", {}, 1)], []

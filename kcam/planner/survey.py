@@ -42,9 +42,9 @@ KINDS = (
 )
 """What a tile may have much of."""
 
-OF_DEPTH, EDGES, NEIGHBOURS, BEYOND = KINDS[2:5], slice(3, 5), 5, 6
-"""The kinds that nothing but depth makes hurt, and those of its edges; the contrast between neighbours; and what the
-full well cuts off.
+OF_DEPTH, BEHIND, NEIGHBOURS, BEYOND = KINDS[2:5], 4, 5, 6
+"""The kinds that nothing but depth makes hurt; what may be hidden; the contrast between neighbours; and what the full
+well cuts off.
 """
 
 CLIPPING = (ShotNoise, DarkCurrent, Clip)
