@@ -171,27 +171,32 @@ class Evaluator:
             return self._hidden(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
-            energies = torch.stack(spectra.energies(changes, against))
-            for rows, factor in sample.of_owners():
-                off, all_of_it = energies[:, rows].sum(1).tolist()
-                lost = self.lost[sample.owners[rows[0]]]
-                found.append(factor * lost * math.sqrt(off / all_of_it) if all_of_it else 0.0)
+            found += self._relative(sample, torch.stack(spectra.energies(changes, against)))
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """The error of what does not hide what it should: of the scene with most light behind edges of depth, and at most
+        """The error of what does not hide what it should, of the scenes with most light behind edges of depth; at most
         that light where there is hardly any.
         """
         behind = [float(one.relative()[BEHIND].sqrt()) for one in self.items]
-        if max(behind) < HARDLY:
-            return max(behind)
-        worst, found = max({*self.lost}, key=behind.__getitem__), [0.0]
+        found, tried, pixels = [min(light, HARDLY) for light in behind], set(), 0
+        for owner in sorted({*self.lost}, key=behind.__getitem__, reverse=True):
+            if behind[owner] >= HARDLY and pixels < LARGEST:
+                tried.add(owner)
+                pixels += self.items[owner].recorded.numel() * TILE**2
         for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
-            for rows, factor in sample.of_owners():
-                if sample.owners[rows[0]] == worst:
-                    off, all_of_it = torch.stack(spectra.hiding(changes, against, rows)).sum(1).tolist()
-                    found.append(factor * self.lost[worst] * math.sqrt(off / all_of_it) if all_of_it else 0.0)
+            rows = [row for row, owner in enumerate(sample.owners) if owner in tried]
+            if rows:
+                energies = torch.zeros(2, len(sample.owners), dtype=torch.float64)
+                energies[:, rows] = torch.stack(spectra.hiding(changes, against, rows))
+                found += self._relative(sample, energies)
         return max(found)
+
+    def _relative(self, sample: Sample, energies: Tensor) -> Iterator[float]:
+        """The error of each whole, from those of its rows and of what they are relative to, (2, B)."""
+        for rows, factor in sample.of_owners():
+            off, all_of_it = energies[:, rows].sum(1).tolist()
+            yield factor * self.lost[sample.owners[rows[0]]] * math.sqrt(off / all_of_it) if all_of_it else 0.0
 
     def last(self, changes: Mapping[str, Any], skipped: Sequence[int]) -> float:
         """True error of a finished plan on all that it is for, or on the worst of it: the worst over the scenes."""

@@ -206,6 +206,7 @@ class _View:
         self.apart = evaluator.apart if evaluator.varies else None
         self.largest = CROP if any(sample.places for sample in evaluator.samples) else max(scene.shape[1:])
         self.trained = any(p.requires_grad for p in imaging.parameters())
+        self.computed = isinstance(lens, Lens) or imaging.varies  # else PSFs cost next to nothing
         self.beside = self.few()
 
     def places(self, apart: float) -> tuple[int, int]:
@@ -226,7 +227,7 @@ class _View:
     def few(self, *, bands: bool = True, layers: bool = True, window: bool = True) -> dict[str, Any]:
         """Cheap settings of the others."""
         few: dict[str, Any] = {}
-        if bands and self.bands > FEW_BANDS:
+        if bands and self.bands > FEW_BANDS and self.computed:
             few["bands"] = FEW_BANDS
         if layers and self.layers > FEW_LAYERS:
             few["layers"] = FEW_LAYERS
