@@ -1,10 +1,10 @@
 """Whether plans keep their word: random pairs of camera and scene, planned at five tolerances and measured.
 
-    python -m benchmarks.planner [--pairs 300] [--hard 100] [--start 0] [--out benchmarks/results/planner.json]
+    python -m benchmarks.planner [--random 300] [--hard 100] [--adversarial 200] [--start 0] [--out FILE.json]
 
 It goes on where it stopped: pairs that are in the file of partial results are not measured again. Each pair follows
 from its seed alone. A pair whose reference would take more than `LONGEST` is drawn again, and counted. Hard pairs are
-those that a plan could overlook, `hard_pair`. An error is the worst of the whole batch and of each item in it.
+those that a plan could overlook, `hard_pair`; adversarial ones, `adversarial_pair`, are through other optics. An error is the worst of the whole batch and of each item in it.
 """
 
 from __future__ import annotations
@@ -398,14 +398,17 @@ def smooth_field(shape: tuple[int, int], *, scale: float | None, generator: torc
     return (field - low) / (high - low)
 
 
+COUNTS = {"random": 300, "hard": 100, "adversarial": 200}
+PAIRS = {"random": random_pair, "hard": hard_pair, "adversarial": adversarial_pair}
+
 # ---- the measurement -----------------------------------------------------------------------------------------------
 
 
 def measure_pair(
-    seed: int, *, hard: bool = False, tolerances: tuple[float, ...] = TOLERANCES, rounds: int = 3
+    kind: str, seed: int, *, tolerances: tuple[float, ...] = TOLERANCES, rounds: int = 3
 ) -> dict[str, Any]:
     """One pair: for each tolerance the estimate, the truth, and the times of the raw, by turns with the reference's."""
-    camera, scene, text, again = hard_pair(seed) if hard else random_pair(seed)
+    camera, scene, text, again = PAIRS[kind](seed)
     with torch.no_grad():
         planner = Planner(camera, scene)
         plans = [planner.plan(tolerance) for tolerance in tolerances]
@@ -443,7 +446,7 @@ def measure_pair(
                 "changes": plan.changes,
             }
         )
-    return {"seed": f"hard {seed}" if hard else seed, "pair": text, "drawn_again": again, "tolerances": rows}
+    return {"seed": f"{kind} {seed}", "pair": text, "drawn_again": again, "tolerances": rows}
 
 
 def _whole(camera: Camera, scene: Scene, **how: Any) -> float:
@@ -456,8 +459,8 @@ def _whole(camera: Camera, scene: Scene, **how: Any) -> float:
 
 def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """For each tolerance: how many are inside, how good the estimates are, and how much faster the plans."""
-    rows = []
-    for index, tolerance in enumerate(TOLERANCES):
+    rows: list[dict[str, Any]] = []
+    for index, tolerance in enumerate(TOLERANCES if pairs else ()):
         found = [pair["tolerances"][index] for pair in pairs]
         ratios = [row["expected"] / row["error"] for row in found if row["error"] > 0 and row["expected"] > 0]
         gains = sorted(row["reference_seconds"] / row["seconds"] for row in found)
@@ -510,8 +513,8 @@ def first_pictures(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def main() -> None:
     """Measure what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--pairs", type=int, default=300)
-    parser.add_argument("--hard", type=int, default=100)
+    for kind, count in COUNTS.items():
+        parser.add_argument(f"--{kind}", type=int, default=count)
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
@@ -519,12 +522,13 @@ def main() -> None:
     partial = arguments.out.with_suffix(".partial.jsonl")
     known = [json.loads(line) for line in partial.read_text().splitlines()] if partial.exists() else []
     done = {pair["seed"]: pair for pair in known}
-    seeds = range(arguments.start, arguments.start + arguments.pairs)
-    hard = [f"hard {seed}" for seed in range(arguments.start, arguments.start + arguments.hard)]
-    for key in [*seeds, *hard]:
+    seeds = {
+        kind: range(arguments.start, arguments.start + getattr(arguments, kind)) for kind in COUNTS
+    }
+    for kind, seed in [(kind, seed) for kind, own in seeds.items() for seed in own]:
+        key = f"{kind} {seed}"
         if key not in done:
-            number = key if isinstance(key, int) else int(key.removeprefix("hard "))
-            done[key] = measure_pair(number, hard=isinstance(key, str))
+            done[key] = measure_pair(kind, seed)
             with partial.open("a") as file:
                 file.write(json.dumps(done[key]) + "\n")
             worst = max(row["error"] / row["tolerance"] for row in done[key]["tolerances"])
@@ -532,30 +536,24 @@ def main() -> None:
             gain = third["reference_seconds"] / third["seconds"]
             text = f"worst {worst:.2f} of the tolerance; {gain:.1f} times as fast at 0.01"
             print(f"{key}: {done[key]['pair']}: {text}", flush=True)
-    pairs, hard_pairs = ([done[key] for key in keys] for keys in (seeds, hard))
+    found = {kind: [done[f"{kind} {seed}"] for seed in own] for kind, own in seeds.items()}
     failures = [
         {"seed": pair["seed"], "pair": pair["pair"], **row}
-        for pair in [*pairs, *hard_pairs]
+        for own in found.values()
+        for pair in own
         for row in pair["tolerances"]
         if row["error"] > row["tolerance"]
     ]
-    again = sum(pair["drawn_again"] for pair in pairs)
-    content = {
-        "environment": measure.environment(),
-        "summary": summary(pairs),
-        "drawn_again": again,
-        "longest_seconds": LONGEST,
-        "first_pictures": first_pictures(pairs),
-        "hard_summary": summary(hard_pairs) if hard_pairs else [],
-        "hard_first_pictures": first_pictures(hard_pairs),
-        "failures": failures,
-        "pairs": pairs,
-        "hard_pairs": hard_pairs,
-    }
+    content: dict[str, Any] = {"environment": measure.environment(), "longest_seconds": LONGEST, "failures": failures}
+    for kind, own in found.items():
+        again = sum(pair["drawn_again"] for pair in own)
+        own_summary = {"summary": summary(own), "first_pictures": first_pictures(own), "drawn_again": again}
+        content[kind] = own_summary | {"pairs": own}
     measure.write_json(arguments.out, content)
-    for row in [value for name in content if name.endswith(("summary", "pictures")) for value in content[name]]:
-        print(row)
-    print(f"{len(failures)} failures, {again} pairs drawn again")
+    for kind in found:
+        for row in [*content[kind]["summary"], *content[kind]["first_pictures"]]:
+            print(kind, row)
+    print(f"{len(failures)} failures")
 
 
 if __name__ == "__main__":

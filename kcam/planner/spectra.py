@@ -43,6 +43,8 @@ _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hi
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
+_NARROW = 3.0  # times the mean over the bands, a light has at most that is taken for even
+_NARROWLY = 2.0  # times the error where light is not: what is hidden of it no longer cancels what hides it
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 1e-4  # of a scene's light, that planes of fewer spectra may leave out
 FEW_BANDS = 3
@@ -96,14 +98,31 @@ class Spectra:
     @functools.cached_property
     def grey(self) -> Spectra:
         """The same in grey light of a few wavelengths: depth, and what hides what, have no colour, but lenses have."""
-        scene, few = self.scene, self._few
+        light, few = self._light, self._few
+        even = torch.ones(1, len(few)).to(light)
+        grey = replace(self.scene, coefficients=light, spectra=even, wavelengths=few, illuminant=even[0])
+        return Spectra(self.imaging, grey, None, picture=self.picture, wavelengths=self.wavelengths)
+
+    @functools.cached_property
+    def _light(self) -> Tensor:
+        """What is recorded of each pixel in all bands, (B, 1, H, W)."""
+        scene = self.scene
         spectra = torch.eye(len(scene.wavelengths)) if scene.spectra is None else scene.spectra
         weights = torch.ones(1, len(scene.wavelengths)) if self.weights is None else self.weights.abs()
         shares = (weights.sum(0).to(spectra) @ spectra.T).to(scene.coefficients)
-        light = torch.einsum("k,bkhw->bhw", shares, scene.coefficients)[:, None]
-        even = torch.ones(1, len(few)).to(spectra)
-        grey = replace(scene, coefficients=light, spectra=even, wavelengths=few, illuminant=even[0])
-        return Spectra(self.imaging, grey, None, picture=self.picture, wavelengths=self.wavelengths)
+        return torch.einsum("k,bkhw->bhw", shares, scene.coefficients)[:, None]
+
+    @functools.cached_property
+    def _white(self) -> Spectra | None:
+        """The same in even light, where its own is of a narrow band: what hides it is counted in even light."""
+        scene, even = self.scene, torch.ones(1, len(self.scene.wavelengths)).to(self._light)
+        if scene.spectra is None or self.weights is None:
+            return None
+        light = scene.spectra.to(even).T @ scene.coefficients.mean((0, 2, 3)).to(even)
+        if float(light.max()) < _NARROW * float(light.mean()):
+            return None
+        white = replace(scene, coefficients=self._light, spectra=even, illuminant=even[0])
+        return Spectra(self.imaging, white, self.weights, picture=self.picture, wavelengths=self.wavelengths)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -127,7 +146,12 @@ class Spectra:
         different layers, where that has the finer ones.
         """
         if changes.get("layers") == against.get("layers"):
-            return self._linear(changes, against)
+            off, all_of_it = self._linear(changes, against)
+            if not self._hides or self._white is None:
+                return off, all_of_it
+            hiding, white = self._white._linear(changes, against)
+            hiding *= all_of_it / white.clamp(min=1e-300)
+            return (_NARROWLY * (off.sqrt() + hiding.sqrt())) ** 2, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
@@ -144,8 +168,7 @@ class Spectra:
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, against) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
-            hidden = len(layered.vergences) > 1 and self.imaging.accuracy.occlusion
-            found[0, rows] *= (_HIDDEN if hidden else 1.0) ** 2
+            found[0, rows] *= (_HIDDEN if len(layered.vergences) > 1 and self._hides else 1.0) ** 2
         return found[0] * (1.0 if self.fits else _CUT) ** 2, found[1]
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
@@ -227,6 +250,11 @@ class Spectra:
 
     def _window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
         return imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
+
+    @property
+    def _hides(self) -> bool:
+        """Whether one part of the scene may hide another."""
+        return self.imaging.accuracy.occlusion and torch.as_tensor(self.scene.depth).ndim > 1
 
     @functools.cached_property
     def fits(self) -> bool:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 import kcam
-from benchmarks.planner import LATER, TOLERANCES, hard_pair, later_scene, random_pair
+from benchmarks.planner import LATER, TOLERANCES, adversarial_pair, hard_pair, later_scene, random_pair
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.effects import Work
 from kcam.optics.propagation.row import Propagator
@@ -56,6 +56,9 @@ def ramp(near: float, far: float, size: int = 48) -> Tensor:
 
 def choice(plan: Plan, effect: str) -> str:
     return next(row.chosen for row in plan.decisions if row.effect == effect)
+
+
+ADVERSARIAL = (1, 8, 9, 13, 30, 37)  # of each kind of optics
 
 
 # ---- honesty -------------------------------------------------------------------------------------------------------
@@ -179,6 +182,20 @@ def test_hard_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> None:
     sides = (384, 560, 768) if seed % 4 == 0 else (64, 96, 160)
     shot, light, text, _ = hard_pair(seed, sides=sides)
     assert_inside(shot, light, (0.03, 0.003), text)
+
+
+@pytest.mark.parametrize("seed", ADVERSARIAL)
+def test_adversarial_pairs_stay_inside_the_tolerance(seed: int) -> None:
+    """Real lenses over the field, measured PSFs, maps of pixels and rings with noise, narrow-band light."""
+    shot, light, text, _ = adversarial_pair(seed, sides=(32, 48, 64))
+    assert_inside(shot, light, (0.03, 0.001), text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(200, 224))
+def test_adversarial_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> None:
+    shot, light, text, _ = adversarial_pair(seed)
+    assert_inside(shot, light, (0.1, 0.01, 0.001), text)
 
 
 @pytest.mark.parametrize("seed", [0, 3])
