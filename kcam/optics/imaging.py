@@ -417,23 +417,27 @@ class Imaging(Stage):
         return max(1, int(self.accuracy.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
 
     def work(
-        self, scene: Scene, *, channels: int | None = None, apart: int | None = None, vergences: Tensor | None = None
+        self,
+        scene: Scene,
+        *,
+        channels: int | None = None,
+        apart: int | None = None,
+        known: tuple[Tensor, Tensor] | None = None,
     ) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands. A lens
         has been traced over its field; apart: pixels between places where `spacing` leaves that to the scene, if known.
-        vergences: of the layers in which there is anything, if known.
+        known: planes of the scene as `working` gives them, and vergences of the layers in which there is anything.
         """
         if len(groups_of := alike(scene)) > 1:
             works = [self.work(scene.samples(rows), channels=channels, apart=apart) for rows in groups_of]
             return sum(works[1:], works[0])
-        planes = self.working(scene)
+        planes, vergences = (self.working(scene), self.filled(scene)) if known is None else known
         batch, count, height, width = planes.shape
         bands, factored = scene.wavelengths.numel(), scene.spectra is not None
         first, rank = Work(), self.accuracy.rank
         if rank is not None and rank < count:
             touched = float(batch * height * width * count * (count / 8 + rank))
             first, count, factored = Work({"touch": touched}, planes.element_size() * touched / count), rank, True
-        vergences = self.filled(scene) if vergences is None else vergences
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         layers, itemsize = vergences.numel(), planes.element_size()
         channels = None if layers > 1 and self.accuracy.per_band else channels

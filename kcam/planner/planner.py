@@ -339,7 +339,7 @@ class _Prices:
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
-        self.filled: dict[tuple[Any, ...], torch.Tensor] = {}
+        self.known: dict[tuple[Any, ...], tuple[torch.Tensor, torch.Tensor]] = {}
         self.scene = scenes[0]
         if len(scenes) > 1:
             self.scene = max(scenes, key=lambda scene: self._seconds(scene))
@@ -357,11 +357,14 @@ class _Prices:
     def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
         if self.imaging is None:
             return Work()
-        imaging, vergences = self.imaging.changed(**self.always | dict(changes)), None
+        imaging = self.imaging.changed(**self.always | dict(changes))
+        known = None
         if torch.as_tensor(scene.depth).ndim != 1:  # else each distance is a picture of its own
-            key = id(scene), imaging.layers, imaging.interpolate, imaging.blur
-            vergences = self.filled[key] = self.filled[key] if key in self.filled else imaging.filled(scene)
-        return imaging.work(scene, channels=self.channels, apart=self.apart, vergences=vergences)
+            key = id(scene), imaging.layers, imaging.interpolate, imaging.blur, imaging.precision
+            if key not in self.known:
+                self.known[key] = imaging.working(scene), imaging.filled(scene)
+            known = self.known[key]
+        return imaging.work(scene, channels=self.channels, apart=self.apart, known=known)
 
     def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
         """(seconds, bytes) with changes of the Imaging."""

@@ -2,10 +2,11 @@
 
     E^2 = sum_f tr(D(f) C(f) D(f)^H),   D_rk = sum_l A_rl S_kl (H_l - G_l)
 
-C are the cross-spectra of a scene's planes, mirrored at its borders (a cosine transform), in rings of frequency; H and
-G are transfer functions, of which slices through the middle suffice: light that runs more along x sees that along x.
-A^T A is what pixels record of each pair of bands, in their mean. With layers of depth each plane is split among them,
-without occlusion, and each layer has transfer functions of its own; where there are fewer, those of its neighbours.
+C are the cross-spectra of a scene's planes, in rings of frequency: mirrored at its borders, by a cosine transform, or
+dark there. H and G are transfer functions, of which slices through the middle suffice: light that runs more along x
+sees that along x. A^T A is what pixels record of each pair of bands, in their mean. With layers of depth each plane is
+split among them, without occlusion, and each layer has transfer functions of its own; where there are fewer, those of
+its neighbours.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from scipy.fft import dctn
+from scipy.fft import dctn, rfftn
 from torch import Tensor
 
 from kcam.camera import Camera
@@ -185,7 +186,8 @@ class Spectra:
             vergences, shares = imaging.layers_of(scene, planes)
             if shares is not None:
                 planes = (planes[:, :, None] * shares[:, None]).flatten(1, 2)
-            crossed = torch.stack([_crossed(own, self.frequencies) for own in planes])
+            dark = imaging.border == "zero"
+            crossed = torch.stack([_crossed(own, self.frequencies, dark=dark) for own in planes])
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
 
@@ -371,14 +373,21 @@ def _rings() -> Tensor:
     return torch.cat([torch.zeros(1, dtype=torch.float64), fine, even])
 
 
-def _crossed(planes: Tensor, frequencies: Tensor) -> Tensor:
-    """Cross-spectra of planes (K, H, W), mirrored at the borders: (2, F, K, K) of light that runs along x, and y."""
-    spectrum = torch.as_tensor(dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))
-    fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in planes.shape[-2:])
+def _crossed(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
+    """Cross-spectra of planes (K, H, W), mirrored at the borders, or in the dark: (2, F, K, K) of light that runs along
+    x, and y.
+    """
+    size = [2 * n for n in planes.shape[-2:]]
+    if dark:
+        spectrum = torch.view_as_real(torch.as_tensor(rfftn(planes.cpu().numpy(), s=size, axes=(-2, -1), norm="ortho")))
+        fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64).abs(), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    else:
+        spectrum = torch.as_tensor(dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
+        fy, fx = (torch.arange(n // 2, dtype=torch.float64) / n for n in size)
     radius = torch.hypot(fy[:, None], fx)
     ring = torch.bucketize(radius.flatten(), (frequencies[1:] + frequencies[:-1]) / 2)
     label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
     order = label.argsort(stable=True)
     counts = label.bincount(minlength=2 * len(frequencies)).tolist()
-    parts = spectrum.flatten(1)[:, order].split(counts, dim=1)
-    return torch.stack([part @ part.T for part in parts]).double().unflatten(0, (2, -1))
+    parts = spectrum.flatten(1, 2)[:, order].split(counts, dim=1)
+    return torch.stack([part.flatten(1) @ part.flatten(1).T for part in parts]).double().unflatten(0, (2, -1))

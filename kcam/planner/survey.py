@@ -160,6 +160,8 @@ def _tiled(planes: Tensor, part: slice) -> Tensor:
 
 def _ends(vergence: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
     """Farthest and nearest vergence of each tile, (R, C)."""
+    if not any(vergence.stride()):  # one for all
+        return vergence.flatten()[:1].expand(rows, columns), vergence.flatten()[:1].expand(rows, columns)
     tiles = _tiled(vergence, slice(0, rows))[0].unflatten(-1, (-1, TILE)).unflatten(0, (-1, TILE))
     return tiles.amin((1, 3)), tiles.amax((1, 3))
 
