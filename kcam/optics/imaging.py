@@ -454,9 +454,9 @@ class Imaging(Stage):
             weights=None if channels is None else shaped(channels, bands),
             **self._rendering(scene),
         )
-        rendering = renderer.work(coverage=layers > 1 and self.accuracy.occlusion)
+        rendering = renderer.work(batch=batch, coverage=layers > 1 and self.accuracy.occlusion)
         scale = itemsize / 4  # twice as many bytes take twice as long
-        operations = {kind: number * layers * batch * scale for kind, number in rendering.operations.items()}
+        operations = {kind: number * layers * scale for kind, number in rendering.operations.items()}
         operations["layer"] = float(layers)
         bank = 0.0
         if self.accuracy.blur:
@@ -470,7 +470,7 @@ class Imaging(Stage):
         shares = float(layers * height * width * batch * 16) if layers > 1 else 0.0
         zones = 1 if self._positions is None else len(self._positions)
         operations = {kind: count * zones for kind, count in operations.items()}
-        return first + Work(operations, rendering.memory * batch + bank + shares)
+        return first + Work(operations, rendering.memory + bank + shares)
 
     def _field_work(
         self,
@@ -506,15 +506,15 @@ class Imaging(Stage):
             weights=None if channels is None else shaped(channels, bands),
             **rendering,
         )
-        zone = renderer.work(coverage=layers > 1 and own.occlusion)
         batch, scale = len(planes), planes.element_size() / 4
-        operations = {kind: n * layers * batch * scale * (zones + tried) for kind, n in zone.operations.items()}
+        zone = renderer.work(batch=batch, coverage=layers > 1 and own.occlusion)
+        operations = {kind: n * layers * scale * (zones + tried) for kind, n in zone.operations.items()}
         operations |= {"field": 1.0, "layer": float(layers * zones)}
         operations |= {kind: number * ((places + tried) * computed + colours) for kind, number in psf.items()}
         operations["touch"] += 60.0 * planes.numel() * (own.distortion + 0.1 * own.relative_illumination)
         held = float(2 * nodes[1] * layers * groups * window[0] * window[1] * planes.element_size())
         shares = float(layers * picture[0] * picture[1] * batch * 16) if layers > 1 else 0.0
-        return Work(operations, zone.memory * batch + held + shares)
+        return Work(operations, zone.memory + held + shares)
 
     # ---- rendering -------------------------------------------------------------------------------------------------
 

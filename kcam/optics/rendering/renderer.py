@@ -40,27 +40,30 @@ class Renderer(Bank):
         """Where zeros lie beyond the picture it is dark there, not empty: what stands at the border goes on."""
         return replace(self, border="replicate") if self.border == "zero" else self
 
-    def work(self, *, coverage: bool) -> Work:
-        """What one layer of one picture takes, with its coverage or without; of tensors the shapes are enough."""
-        inputs, kernels, products, _, held, touched = choose(self).takes(self)
+    def work(self, *, batch: int, coverage: bool) -> Work:
+        """What one layer of a batch of pictures takes, with its coverage or without; of tensors the shapes are enough."""
+        inputs, kernels, products, _, held, touched, contracted = choose(self).takes(self)
         points, pixels, kernel = (math.prod(size) for size in (self.sizes.size, self.picture, self.window))
         tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
         if coverage and self.weights is not None:
-            touched += out * self.groups * kernel
+            contracted += out * self.groups * kernel
         if self.direct:
             summed = products + (2 * out if coverage else 0)
             slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
             memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
             touched += float((inputs + 2 * out) * pixels)
-            return Work({"product": float(summed * pixels * kernel * slow), "touch": touched}, memory)
-        transforms = float(tiles * (inputs + out) + kernels)
-        touched += float(tiles * points * (inputs + out + products) + kernels * points)
+            operations = {"product": float(batch * summed * pixels * kernel * slow)}
+            return Work(operations | {"touch": batch * touched + contracted}, batch * memory)
+        transforms = float(batch * tiles * (inputs + out) + kernels)  # those of the PSFs once
+        touched += float(tiles * points * (inputs + out + products))
+        contracted += kernels * points
         if coverage:
             ratio = math.prod(self._of_masks.sizes.size) / points
-            transforms += ratio * (tiles * 2 * (1 + out) + out)
+            transforms += ratio * (batch * tiles * 2 * (1 + out) + out)
             touched += ratio * tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
-        memory = float(itemsize * (held * points + (inputs + out) * pixels))
-        operations = {"transform": transforms * points * math.log2(max(2, points)), "touch": touched}
+        memory = float(batch * itemsize * (held * points + (inputs + out) * pixels))
+        operations = {"transform": transforms * points * math.log2(max(2, points))}
+        operations["touch"] = batch * touched + contracted
         if pixels > _NEAR:  # whole it is touched again and again in far memory, in tiles once
-            operations["large"] = float(pixels * (inputs + out) * (2 if tiles == 1 else 1))
+            operations["large"] = float(batch * pixels * (inputs + out) * (2 if tiles == 1 else 1))
         return Work(operations, memory)

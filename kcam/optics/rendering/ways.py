@@ -124,7 +124,7 @@ class Bank:
 
 
 class Takes(NamedTuple):
-    """What a way takes for one picture, in planes but for the pixels touched where PSFs or planes are contracted."""
+    """What a way takes for one picture, in planes but for the pixels touched where planes are contracted, and PSFs."""
 
     inputs: int  # transformed
     kernels: int  # transformed
@@ -132,6 +132,7 @@ class Takes(NamedTuple):
     cost: float  # by which the way is chosen, in transforms; ten products take the time of one
     held: float  # in memory
     touched: float = 0.0
+    contracted: float = 0.0  # once for a batch, as kernels are
 
 
 class Way(NamedTuple):
@@ -201,8 +202,9 @@ def _kernels_take(n: Bank) -> Takes:
     kernels = n.channels * n.planes
     few = kernels <= n.groups  # measured: the kernels' own contraction runs well
     cost = (0.0 if few else n.planes + kernels) if n.spectra is not None else inf
-    touched = kernels * n.groups * prod(n.window)
-    return Takes(n.planes, kernels, kernels, cost=cost, held=n.planes + kernels + 3 + n.channels, touched=touched)
+    contracted = kernels * n.groups * prod(n.window)
+    held = n.planes + kernels + 3 + n.channels
+    return Takes(n.planes, kernels, kernels, cost=cost, held=held, contracted=contracted)
 
 
 def _kernels(bank: Bank, psfs: Tensor) -> Blur:
