@@ -15,7 +15,7 @@ import math
 import random
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from kcam import Camera, Scene, isp, measure, optics, sensor
 from kcam.optics.compound.presets import PRESETS
-from kcam.planner import Planner, make_plan, relative_rms, timed
+from kcam.planner import Planner, costs, make_plan, relative_rms, timed
 from kcam.planner.planner import fresh
 from kcam.units import mm, um, wavelength_grid
 
@@ -405,17 +405,22 @@ PAIRS = {"random": random_pair, "hard": hard_pair, "adversarial": adversarial_pa
 
 
 def measure_pair(
-    kind: str, seed: int, *, tolerances: tuple[float, ...] = TOLERANCES, rounds: int = 3
+    kind: str, seed: int, rates: Mapping[str, float], *, tolerances: tuple[float, ...] = TOLERANCES, rounds: int = 3
 ) -> dict[str, Any]:
-    """One pair: for each tolerance the estimate, the truth, and the times of the raw, by turns with the reference's."""
+    """One pair: for each tolerance the estimate, the truth, and the times of the raw, by turns with the reference's.
+
+    rates: of this machine, as `costs.calibrate` found them. Of adversarial pairs no first picture is taken.
+    """
     camera, scene, text, again = PAIRS[kind](seed)
+    alone, first, wholes = {}, {}, []
     with torch.no_grad():
         planner = Planner(camera, scene)
         plans = [planner.plan(tolerance) for tolerance in tolerances]
-        alone = {tolerance: make_plan(camera, scene, tolerance=tolerance).planning_seconds for tolerance in FIRST}
-        wholes = [_whole(camera, scene)]
-        first = {tolerance: _whole(camera, scene, tolerance=tolerance) for tolerance in FIRST}
-        wholes.append(_whole(camera, scene))
+        if kind != "adversarial":
+            alone = {tolerance: make_plan(camera, scene, tolerance=tolerance).planning_seconds for tolerance in FIRST}
+            wholes.append(_whole(camera, scene))
+            first = {tolerance: _whole(camera, scene, tolerance=tolerance) for tolerance in FIRST}
+            wholes.append(_whole(camera, scene))
         reference, truth = timed(camera, scene)
         shots: list[list[tuple[float, Tensor]]] = [[] for _ in plans]
         references = [reference]
@@ -438,11 +443,12 @@ def measure_pair(
                 "seconds": statistics.median(seconds for seconds, _ in shot),
                 "reference_seconds": statistics.median(references),
                 "predicted_seconds": plan.seconds,
+                "calibrated_seconds": costs.seconds(planner.prices.work(plan.changes), rates),
                 "predicted_reference_seconds": plan.reference_seconds,
                 "planning_seconds": plan.planning_seconds,
                 "first_planning_seconds": alone.get(tolerance),
                 "first_seconds": first.get(tolerance),
-                "first_reference_seconds": statistics.mean(wholes),
+                "first_reference_seconds": statistics.mean(wholes) if wholes else None,
                 "changes": plan.changes,
             }
         )
@@ -464,7 +470,9 @@ def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
         found = [pair["tolerances"][index] for pair in pairs]
         ratios = [row["expected"] / row["error"] for row in found if row["error"] > 0 and row["expected"] > 0]
         gains = sorted(row["reference_seconds"] / row["seconds"] for row in found)
-        predicted = [row["predicted_seconds"] / row["seconds"] for row in found]
+        predicted, calibrated = (
+            [row[f"{by}_seconds"] / row["seconds"] for row in found] for by in ("predicted", "calibrated")
+        )
         rows.append(
             {
                 "tolerance": tolerance,
@@ -476,6 +484,9 @@ def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "speed_up_quartiles": [gains[len(gains) // 4], gains[3 * len(gains) // 4]],
                 "speed_up_least": gains[0],
                 "predicted_over_measured": statistics.median(predicted),
+                "mispredicted": statistics.median(max(ratio, 1 / ratio) for ratio in predicted),
+                "mispredicted_calibrated": statistics.median(max(ratio, 1 / ratio) for ratio in calibrated),
+                "bounds_too_low": sum(row["bound"] < 0.8 * row["error"] for row in found if row["error"] > 1e-6),
                 "planning_share": statistics.median(
                     row["planning_seconds"] / row["reference_seconds"] for row in found
                 ),
@@ -491,7 +502,7 @@ def first_pictures(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for tolerance in FIRST:
         found = [row for pair in pairs for row in pair["tolerances"] if row["tolerance"] == tolerance]
-        found = [row for row in found if row["reference_seconds"] > SEEN]
+        found = [row for row in found if row["first_seconds"] is not None and row["reference_seconds"] > SEEN]
         gains = [row["first_reference_seconds"] / row["first_seconds"] for row in found]
         felt = [row for row in found if row["reference_seconds"] > FELT]
         if felt:
@@ -522,13 +533,12 @@ def main() -> None:
     partial = arguments.out.with_suffix(".partial.jsonl")
     known = [json.loads(line) for line in partial.read_text().splitlines()] if partial.exists() else []
     done = {pair["seed"]: pair for pair in known}
-    seeds = {
-        kind: range(arguments.start, arguments.start + getattr(arguments, kind)) for kind in COUNTS
-    }
+    rates, _ = costs.calibrate()
+    seeds = {kind: range(arguments.start, arguments.start + getattr(arguments, kind)) for kind in COUNTS}
     for kind, seed in [(kind, seed) for kind, own in seeds.items() for seed in own]:
         key = f"{kind} {seed}"
         if key not in done:
-            done[key] = measure_pair(kind, seed)
+            done[key] = measure_pair(kind, seed, rates)
             with partial.open("a") as file:
                 file.write(json.dumps(done[key]) + "\n")
             worst = max(row["error"] / row["tolerance"] for row in done[key]["tolerances"])

@@ -190,7 +190,9 @@ class Imaging(Stage):
         own = self.changed()
         if not self.varies and self._positions is None:
             ends = torch.stack(wavelengths.aminmax()) if getattr(self.lens, "symmetric", False) else wavelengths[:0]
-            own.known = replace(self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={}, windows={})
+            own.known = replace(
+                self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={}, windows={}
+            )
         return own
 
     def _check_recipe(self) -> None:

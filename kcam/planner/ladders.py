@@ -99,7 +99,9 @@ class Ladder:
     def _followed(self) -> int:
         """The rung of the ladder that it follows, or one that tells as much."""
         levels, position = self.follows.levels if self.follows else [], self.follows.position if self.follows else 0
-        return next((index for index, level in enumerate(levels[:position]) if level.fineness >= self.settled), position)
+        return next(
+            (index for index, level in enumerate(levels[:position]) if level.fineness >= self.settled), position
+        )
 
     def price(self, evaluator: Evaluator) -> None:
         """Estimate the error of the rung that it stands on."""

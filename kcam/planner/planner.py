@@ -354,6 +354,10 @@ class _Prices:
     def _seconds(self, scene: Scene) -> float:
         return 0.0 if self.imaging is None else costs.seconds(self._work(scene, {}), self.rates)
 
+    def work(self, changes: Mapping[str, Any]) -> Work:
+        """With changes of the Imaging."""
+        return self._work(self.scene, changes)
+
     def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
         if self.imaging is None:
             return Work()
@@ -370,7 +374,7 @@ class _Prices:
         """(seconds, bytes) with changes of the Imaging."""
         key = tuple(sorted(changes.items()))
         if key not in self.kept:
-            work = self._work(self.scene, changes)
+            work = self.work(changes)
             self.kept[key] = (costs.seconds(work, self.rates), work.memory)
         return self.kept[key]
 
