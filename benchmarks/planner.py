@@ -4,7 +4,8 @@
 
 It goes on where it stopped: pairs that are in the file of partial results are not measured again. Each pair follows
 from its seed alone. A pair whose reference would take more than `LONGEST` is drawn again, and counted. Hard pairs are
-those that a plan could overlook, `hard_pair`; adversarial ones, `adversarial_pair`, are through other optics. An error is the worst of the whole batch and of each item in it.
+those that a plan could overlook, `hard_pair`; adversarial ones are through other optics, `adversarial_pair`. An error
+is the worst of the whole batch and of each item in it.
 """
 
 from __future__ import annotations

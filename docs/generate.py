@@ -368,14 +368,14 @@ def honesty_table() -> str:
         low, high = row["speed_up_quartiles"]
         lines.append(
             f"| {row['tolerance']:g} | {_inside(row)} | {row['worst']:.2f} of it | "
-            f"{figures(row['estimate_over_truth'])} | **{figures(row['speed_up'])}**, {figures(low)} to {figures(high)} | "
-            f"{figures(row['predicted_over_measured'])} |"
+            f"{figures(row['estimate_over_truth'])} | **{figures(row['speed_up'])}**, {figures(low)} to "
+            f"{figures(high)} | {figures(row['predicted_over_measured'])} |"
         )
     outside = "; ".join(f"{f['pair']}: {scientific(f['error'])} at {f['tolerance']:g}" for f in content["failures"])
     lines += [
         "",
-        f"{len(pairs['pairs'])} pairs, {pairs['drawn_again']} drawn again because their reference would have taken over "
-        f"{content['longest_seconds']:g} s. Outside, of these and of all below: {outside or 'none'}.",
+        f"{len(pairs['pairs'])} pairs, {pairs['drawn_again']} drawn again because their reference would have taken "
+        f"over {content['longest_seconds']:g} s. Outside, of these and of all below: {outside or 'none'}.",
     ]
     for found, of in ((pairs, "pairs"), (hard, "hard pairs"), (adversarial, "adversarial pairs")):
         for row in found["first_pictures"]:
@@ -395,8 +395,8 @@ def honesty_table() -> str:
         ),
         (
             adversarial,
-            "Adversarial pairs (such scenes, a third of them in light of a few nanometres, through wrapped and noisy maps "
-            "of pixels and rings, real lenses over the field, and measured PSFs)",
+            "Adversarial pairs (such scenes, a third of them in light of a few nanometres, through wrapped and noisy "
+            "maps of pixels and rings, real lenses over the field, and measured PSFs)",
         ),
     ):
         inside = ", ".join(f"{_inside(row)} at {row['tolerance']:g}" for row in found["summary"])

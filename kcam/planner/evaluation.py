@@ -205,8 +205,8 @@ class Evaluator:
 
     @functools.cached_property
     def _always(self) -> dict[str, Any]:
-        """Changes under which crops are tried: where optics vary the places are about those of the reference, found once
-        on the whole scenes.
+        """Changes under which crops are tried: where optics vary the places are about those of the reference, found
+        once on the whole scenes.
         """
         if self.imaging is None or not self.varies:
             return {}

@@ -59,8 +59,8 @@ class Ladder:
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
-    always: whether it is told of and climbed without asking whether its foot saves time; urgency: how much more its error counts
-    than others' where the next ladder to climb is chosen.
+    always: whether it is told of and climbed without asking whether its foot saves time; urgency: how much more its
+    error counts than others' where the next ladder to climb is chosen.
     """
 
     effect: str
@@ -93,15 +93,15 @@ class Ladder:
         return 0.0 if self.at_top else self.errors[self._key(self.position)]
 
     def _key(self, position: int) -> tuple[int, int]:
-        return position, self._followed if self.follows else 0
+        return position, self._followed
 
     @property
     def _followed(self) -> int:
-        """The rung of the ladder that it follows, or one that tells as much."""
-        levels, position = self.follows.levels if self.follows else [], self.follows.position if self.follows else 0
-        return next(
-            (index for index, level in enumerate(levels[:position]) if level.fineness >= self.settled), position
-        )
+        """The rung of the ladder that it follows, if any, or one that tells as much."""
+        if self.follows is None:
+            return 0
+        position, below = self.follows.position, self.follows.levels[: self.follows.position]
+        return next((index for index, level in enumerate(below) if level.fineness >= self.settled), position)
 
     def price(self, evaluator: Evaluator) -> None:
         """Estimate the error of the rung that it stands on."""

@@ -41,7 +41,7 @@ class Renderer(Bank):
         return replace(self, border="replicate") if self.border == "zero" else self
 
     def work(self, *, batch: int, coverage: bool) -> Work:
-        """What one layer of a batch of pictures takes, with its coverage or without; of tensors the shapes are enough."""
+        """What one layer of a batch takes, with its coverage or without; of tensors the shapes are enough."""
         inputs, kernels, products, _, held, touched, contracted = choose(self).takes(self)
         points, pixels, kernel = (math.prod(size) for size in (self.sizes.size, self.picture, self.window))
         tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
