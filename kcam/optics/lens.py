@@ -281,7 +281,7 @@ class Lens(ElementStack):
         if self.has_pixel_phase:
             maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
             counts = [samples_by_rule(query, index) for index in range(len(query.wavelengths))]
-            found["map"] = float(sum(maps + (0 if query.paraxial else 3 * count**2) for count in counts))
+            found["map"] = float(sum(maps + (0 if row.paraxial else 3 * count**2) for count in counts))
         return found
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:

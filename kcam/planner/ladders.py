@@ -251,9 +251,11 @@ def _blur(view: _View) -> Iterator[Ladder]:
 
 
 def _model(view: _View) -> Iterator[Ladder]:
-    """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
+    """Paraxial only where that is cheaper: a map of pixels needs no warp then. A single picture uses PSFs that are
+    known, of the other model.
+    """
     lens, propagator = view.imaging.lens, view.imaging.accuracy.propagator
-    if view.row is None or propagator != "nonparaxial" or not isinstance(lens, Lens) or not lens.has_pixels:
+    if view.one or view.row is None or propagator != "nonparaxial" or not isinstance(lens, Lens) or not lens.has_pixels:
         return
     levels = [Level("fresnel", {"propagator": "fresnel"}), Level("nonparaxial", {})]
     yield Ladder("model", levels, view.beside)

@@ -69,8 +69,8 @@ def shoot(
     camera: Camera, scene: Scene, *, tolerance: float | str, generator: torch.Generator | None = None
 ) -> tuple[torch.Tensor, Plan]:
     """One picture within a tolerance, and the plan for it, made and used where that pays: with the PSFs that making it
-    took. It is the reference where all of that takes less than a plan: up to `WORTH`, where optics vary over the
-    picture, whose choices are tried out, and where rings of a profile scatter light far, which takes long to follow.
+    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and where optics vary over the
+    picture, whose choices are tried out.
 
     Arguments and errors: as `make_plan`, and as `Camera`.
     """
