@@ -24,8 +24,10 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH = 0.5
-"""Predicted seconds of a reference picture up to which a plan for it alone takes longer than it saves: measured."""
+WORTH, ROUND = 0.5, 0.35
+"""Predicted seconds of a reference picture up to which a plan for it alone takes longer than it saves, and through a
+round lens without rings: measured.
+"""
 
 SENSOR = "sensor"
 """The tolerance that follows from what a sensor records."""
@@ -111,7 +113,9 @@ class Planner:
         imaging = self.evaluator.imaging
         if imaging is None or self.evaluator.varies:
             return False
-        return self.prices.of({})[0] > WORTH
+        lens: Any = imaging.lens
+        smooth = getattr(lens, "symmetric", False) and not lens.has_rings
+        return self.prices.of({})[0] > (ROUND if smooth else WORTH)
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:

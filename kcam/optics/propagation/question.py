@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcam.cache import differentiated
+from kcam.cache import ValueCache, differentiated
 from kcam.optics.elements.element import Element
 from kcam.optics.elements.stack import ElementStack
 from kcam.optics.propagation import sampling
@@ -28,6 +28,7 @@ from kcam.optics.pupil.coordinates import Pupil, pupil_tau
 from kcam.optics.pupil.maps import pixel_under
 from kcam.optics.source import PixelGrid, Points
 
+_DISPLACEMENTS = ValueCache(16)  # the last: a picture asks for its own at each step
 _SPREAD = 1e-6  # share of the light that the structure of a radius may send beyond the displacement that is sampled
 
 
@@ -190,7 +191,9 @@ class Query:
 
     def spread(self, share: float) -> Tensor:
         """As `displacement`, for another share of the light that a profile of rings may scatter beyond it."""
-        return _ray_displacement(self, share)
+        with torch.no_grad():
+            ends, asked = _outermost(self).vergences, (self.wavelengths, self.device, self.paraxial, share)
+            return _DISPLACEMENTS.get((self.lens, ends, *asked), lambda: _ray_displacement(self, share))
 
     @functools.cached_property
     def panels(self) -> Tensor:
