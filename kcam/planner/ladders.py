@@ -35,6 +35,12 @@ HIDING = 9
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
 
+EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
+"""Models. What other choices cost is the same in both, to 10 % (of 24 maps of pixels, f/5 to f/50)."""
+
+LITTLE = 0.6
+"""Of the time of a picture by one model that it takes by the other: then what is known of that one is not needed."""
+
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
@@ -171,15 +177,17 @@ class Ladder:
         return f"{self.levels[below[0]].label} would cost {self.errors[below]:.2g}"
 
 
-def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:
+def ladders(
+    evaluator: Evaluator, scene: Scene, *, seconds: Callable[[dict[str, Any]], float], one: bool = False
+) -> list[Ladder]:
     """The choices that exist for a camera and a scene (the one that takes longest), of which the evaluator has then
-    seen what it needs; one: those that pay for a single picture.
+    seen what it needs; seconds: predicted for changes of the Imaging; one: those that pay for a single picture.
     """
     imaging = evaluator.imaging
     if imaging is None:
         evaluator.look({})
         return []
-    view = _View(evaluator, imaging, scene, one=one)
+    view = _View(evaluator, imaging, scene, seconds=seconds, one=one)
     evaluator.look(view.beside)
     return [ladder for make in LADDERS for ladder in make(view)]
 
@@ -187,7 +195,15 @@ def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[La
 class _View:
     """What the ladders look at."""
 
-    def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene, *, one: bool) -> None:
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        imaging: Imaging,
+        scene: Scene,
+        *,
+        seconds: Callable[[dict[str, Any]], float],
+        one: bool,
+    ) -> None:
         self.imaging, self.scene, self.one = imaging, scene, one
         planes = imaging.working(scene)
         self.vergences, _ = imaging.layers_of(scene, planes)
@@ -209,6 +225,10 @@ class _View:
         self.largest = CROP if any(sample.places for sample in evaluator.samples) else max(scene.shape[1:])
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.computed = isinstance(lens, Lens) or imaging.varies  # else PSFs cost next to nothing
+        self.stand_in: dict[str, Any] = {}
+        if self.row is not None and self.row.physics == EXACT and isinstance(lens, Lens) and lens.has_pixels:
+            gain = seconds(PARAXIAL) / max(seconds({}), 1e-30)
+            self.stand_in = PARAXIAL if gain < (LITTLE if one else 1.0) else {}
         self.beside = self.few()
 
     def places(self, apart: float) -> tuple[int, int]:
@@ -228,7 +248,7 @@ class _View:
 
     def few(self, *, bands: bool = True, layers: bool = True, window: bool = True) -> dict[str, Any]:
         """Cheap settings of the others."""
-        few: dict[str, Any] = {}
+        few = dict(self.stand_in)
         if bands and self.bands > FEW_BANDS and self.computed:
             few["bands"] = FEW_BANDS
         if layers and self.layers > FEW_LAYERS:
@@ -254,11 +274,9 @@ def _model(view: _View) -> Iterator[Ladder]:
     """Paraxial only where that is cheaper: a map of pixels needs no warp then. A single picture uses PSFs that are
     known, of the other model.
     """
-    lens, propagator = view.imaging.lens, view.imaging.accuracy.propagator
-    if view.one or view.row is None or propagator != "nonparaxial" or not isinstance(lens, Lens) or not lens.has_pixels:
-        return
-    levels = [Level("fresnel", {"propagator": "fresnel"}), Level("nonparaxial", {})]
-    yield Ladder("model", levels, view.beside)
+    if view.stand_in and not view.one:
+        beside = {name: value for name, value in view.few().items() if name not in PARAXIAL}
+        yield Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside)
 
 
 def _sampling(view: _View) -> Iterator[Ladder]:
@@ -286,7 +304,7 @@ def _precision(view: _View) -> Iterator[Ladder]:
 def _wavelengths(view: _View) -> Iterator[Ladder]:
     beside = view.few(bands=False)
     tabled, counts = view.evaluator.tabled(beside), even_counts(view.bands)
-    if view.one and not tabled:  # what half of the PSFs would save is what it takes to find out
+    if view.one and not tabled and not view.stand_in:  # half of the PSFs would save what it takes to find out
         counts = [n for n in counts if 3 * n <= view.bands]
     levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in counts]
     top = Level(f"{view.bands} PSFs", {}, view.bands)

@@ -197,7 +197,8 @@ class Planner:
     def _ways(self) -> tuple[list[Ladder], list[_Skip]]:
         """All choices."""
         if self._known is None:
-            every = ladders(self.evaluator, self.prices.scene, one=self.one)
+            prices = self.prices
+            every = ladders(self.evaluator, prices.scene, seconds=lambda changes: prices.of(changes)[0], one=self.one)
             steps = [ladder for ladder in every if ladder.always or self.prices.saves(ladder)]
             skips = [_Skip(self.camera, index, self.evaluator.signals) for index in self.evaluator.skippable()]
             self._known = steps, skips
