@@ -23,6 +23,7 @@ from kcam.optics.propagation.question import Query, Sampling, residual_vergence
 from kcam.optics.propagation.sampling import KAPPA, MAX_PUPIL_SAMPLES
 from kcam.optics.propagation.table import choose
 from kcam.optics.propagation.thin_field import ThinFieldPSFs
+from kcam.optics.pupil.warp import warp_terms
 from kcam.optics.source import Defocus, PixelGrid, Points
 from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
@@ -273,7 +274,7 @@ class Lens(ElementStack):
     ) -> dict[str, float]:
         """What a bank takes, by kind of work; twice as many bytes take twice as long.
 
-        map: pixels of the maps, and three times the samples that their field is warped onto (a fit).
+        map: pixels of the maps, and the samples that their field is warped onto, times the terms that this takes.
         """
         query = self.question(points, wavelengths, pixels, recipe)
         row = recipe.row(query)
@@ -281,7 +282,8 @@ class Lens(ElementStack):
         if self.has_pixel_phase:
             maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
             counts = [samples_by_rule(query, index) for index in range(len(query.wavelengths))]
-            found["map"] = float(sum(maps + (0 if row.paraxial else 3 * count**2) for count in counts))
+            tau = 0.0 if row.paraxial else float(query.tau.detach())
+            found["map"] = sum(maps + (warp_terms(count, tau) * count**2 if tau else 0.0) for count in counts)
         return found
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
