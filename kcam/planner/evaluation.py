@@ -37,7 +37,7 @@ from kcam.planner.plan import (
     with_imaging,
 )
 from kcam.planner.spectra import LINEAR, Spectra, linear
-from kcam.planner.survey import BEHIND, BEYOND, CLIPPING, KINDS, TILE, Survey, survey
+from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter
 from kcam.sensor.noise import RandomStage
@@ -45,7 +45,7 @@ from kcam.sensor.noise import RandomStage
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
 WITNESSED = 2**20  # pixels of the last trial
-HARDLY = 3e-3  # RMS of light behind edges of depth, of what is recorded, that is taken for what it changes at most
+HARDLY = 3e-3  # RMS of light that may be hidden, of what is recorded, that is taken for what it changes at most
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,16 @@ class Evaluator:
         self.signals = self._signals(few)
         if self.imaging is not None and not self.gradients and not self.varies and linear(self.raw_camera):
             self.spectra = [
-                Spectra.of(self.raw_camera, self.imaging, sample.scene, picture=sample.picture)
+                Spectra.of(
+                    self.raw_camera, self.imaging, sample.scene, picture=sample.picture, hidden=self._hideable(sample)
+                )
                 for sample in self.samples
             ]
+
+    def _hideable(self, sample: Sample) -> Tensor:
+        """See `Spectra`."""
+        items = (self.items[owner] for owner in sample.owners)
+        return torch.tensor([one.hidden**2 / max(one.behind, 1e-3) for one in items], dtype=torch.float64)
 
     @property
     def _signals_by_owner(self) -> Iterator[tuple[int, dict[int, tuple[Tensor, Context]]]]:
@@ -175,13 +182,13 @@ class Evaluator:
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """The error of what does not hide what it should, of the scenes with most light behind edges of depth; at most
+        """The error of what does not hide what it should, of the scenes with most light that may be hidden; at most
         that light where there is hardly any.
         """
-        behind = [float(one.relative()[BEHIND].sqrt()) for one in self.items]
-        found, tried, pixels = [min(light, HARDLY) for light in behind], set(), 0
-        for owner in sorted({*self.lost}, key=behind.__getitem__, reverse=True):
-            if behind[owner] >= HARDLY and pixels < LARGEST:
+        hidden = [one.hidden for one in self.items]
+        found, tried, pixels = [min(light, HARDLY) for light in hidden], set(), 0
+        for owner in sorted({*self.lost}, key=hidden.__getitem__, reverse=True):
+            if hidden[owner] >= HARDLY and pixels < LARGEST:
                 tried.add(owner)
                 pixels += self.items[owner].recorded.numel() * TILE**2
         for sample, spectra in zip(self.samples, self.spectra or (), strict=True):

@@ -24,9 +24,9 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH, ROUND = 0.5, 0.35
-"""Predicted seconds of a reference picture up to which a plan for it alone takes longer than it saves, and through a
-round lens without rings: measured.
+WORTH, ROUND = 1.5, 0.8
+"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and through a
+round lens, whose PSFs cost least to foretell: measured.
 """
 
 SENSOR = "sensor"
@@ -113,9 +113,7 @@ class Planner:
         imaging = self.evaluator.imaging
         if imaging is None or self.evaluator.varies:
             return False
-        lens: Any = imaging.lens
-        smooth = getattr(lens, "symmetric", False) and not lens.has_rings
-        return self.prices.of({})[0] > (ROUND if smooth else WORTH)
+        return self.prices.of({})[0] > (ROUND if getattr(imaging.lens, "symmetric", False) else WORTH)
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:

@@ -44,8 +44,6 @@ _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hi
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
-_NARROW = 3.0  # times the mean over the bands, a light has at most that is taken for even
-_NARROWLY = 2.0  # times the error where light is not: what is hidden of it no longer cancels what hides it
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 1e-4  # of a scene's light, that planes of fewer spectra may leave out
 FEW_BANDS = 3
@@ -76,13 +74,22 @@ class Spectra:
     """A batch of scenes as spectra, before optics and sums over the bands (R, L) that a sensor records, or all bands.
 
     picture: (H, W) of the wholes that they are part of. wavelengths: of the light, of which the scene may have a few.
+    hidden: of each row, the energy of the light that something nearer may hide, of what is recorded, for each share of
+    the pixels that is, (B,); None where that does not count.
     """
 
     def __init__(
-        self, imaging: Imaging, scene: Scene, weights: Tensor | None, *, picture: tuple[int, int], wavelengths: Tensor
+        self,
+        imaging: Imaging,
+        scene: Scene,
+        weights: Tensor | None,
+        *,
+        picture: tuple[int, int],
+        wavelengths: Tensor,
+        hidden: Tensor | None = None,
     ) -> None:
         self.imaging, self.scene, self.weights = imaging, scene, weights
-        self.picture, self.wavelengths = picture, wavelengths
+        self.picture, self.wavelengths, self.hidden = picture, wavelengths, hidden
         self.frequencies = _rings()
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._layered: dict[tuple[int, Any], _Layered] = {}
@@ -91,10 +98,12 @@ class Spectra:
         self._tables: dict[Any, _Table] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
-    def of(cls, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int]) -> Spectra:
+    def of(
+        cls, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int], hidden: Tensor | None = None
+    ) -> Spectra:
         """Those before a camera."""
         recorded, wavelengths = _recorded(camera, scene), scene.wavelengths
-        return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths)
+        return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths, hidden=hidden)
 
     @functools.cached_property
     def grey(self) -> Spectra:
@@ -114,16 +123,11 @@ class Spectra:
         return torch.einsum("k,bkhw->bhw", shares, scene.coefficients)[:, None]
 
     @functools.cached_property
-    def _white(self) -> Spectra | None:
-        """The same in even light, where its own is of a narrow band: what hides it is counted in even light."""
-        scene, even = self.scene, torch.ones(1, len(self.scene.wavelengths)).to(self._light)
-        if scene.spectra is None or self.weights is None:
-            return None
-        light = scene.spectra.to(even).T @ scene.coefficients.mean((0, 2, 3)).to(even)
-        if float(light.max()) < _NARROW * float(light.mean()):
-            return None
-        white = replace(scene, coefficients=self._light, spectra=even, illuminant=even[0])
-        return Spectra(self.imaging, white, self.weights, picture=self.picture, wavelengths=self.wavelengths)
+    def _masks(self) -> Spectra:
+        """Even light everywhere, in the same layers: what hides what is counted in it."""
+        even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
+        ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
+        return Spectra(self.imaging, ones, self.weights, picture=self.picture, wavelengths=self.wavelengths)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -148,11 +152,10 @@ class Spectra:
         """
         if changes.get("layers") == against.get("layers"):
             off, all_of_it = self._linear(changes, against)
-            if not self._hides or self._white is None:
+            if self.hidden is None or not self._hides:
                 return off, all_of_it
-            hiding, white = self._white._linear(changes, against)
-            hiding *= all_of_it / white.clamp(min=1e-300)
-            return (_NARROWLY * (off.sqrt() + hiding.sqrt())) ** 2, all_of_it
+            hiding, even = self._masks._linear(changes, against)
+            return off + self.hidden * hiding / even.clamp(min=1e-300) * all_of_it, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:

@@ -42,10 +42,8 @@ KINDS = (
 )
 """What a tile may have much of."""
 
-OF_DEPTH, BEHIND, NEIGHBOURS, BEYOND = KINDS[2:5], 4, 5, 6
-"""The kinds that nothing but depth makes hurt; what may be hidden; the contrast between neighbours; and what the full
-well cuts off.
-"""
+OF_DEPTH, NEIGHBOURS, BEYOND = KINDS[2:5], 5, 6
+"""The kinds that nothing but depth makes hurt; the contrast between neighbours; and what the full well cuts off."""
 
 CLIPPING = (ShotNoise, DarkCurrent, Clip)
 """Stages that stop at the full well."""
@@ -58,7 +56,8 @@ class Survey:
 
     light: RMS of each band as the sensor weighs it, but for a factor, (L,). depths: RMS of the light in each of the
     `DEFOCUSED` ranges of signed defocus, but for a factor. level: RMS of what is recorded [share of
-    the full well].
+    the full well]. hidden: RMS of the light that something nearer may hide, relative to it; behind: how many of the
+    pixels that is, as a share.
     """
 
     potential: Tensor
@@ -69,6 +68,8 @@ class Survey:
     light: Tensor
     depths: Tensor
     level: float
+    hidden: float
+    behind: float
 
     def relative(self) -> Tensor:
         """Potentials of the whole scene, in the energy that is recorded of it: (7,)."""
@@ -94,6 +95,7 @@ def survey(scene: Scene, camera: Camera, defocus: Defocus) -> list[Survey]:
         potential, recorded = torch.zeros(len(KINDS), rows, columns, dtype=torch.float64), torch.zeros_like(blur)
         depths = torch.zeros(len(DEFOCUSED) + 1, dtype=torch.float64)
         gram = torch.zeros(len(item), len(item), dtype=torch.float64)
+        nearest, hidden, behind = _around(_around(near)), 0.0, 0.0
         for part in _strips(rows, columns):
             light = _tiled(item, part).float()
             flat = light.flatten(1)
@@ -115,12 +117,18 @@ def survey(scene: Scene, camera: Camera, defocus: Defocus) -> list[Survey]:
                     _sums(seen - kept) if full else torch.zeros_like(own),
                 ]
             )
-            sharp = defocus.spread * (_tiled(depth, part)[0] - sum(defocus.focus) / 2)
-            depths += _by_defocus(seen, sharp) if span else 0.0
             recorded[part] = (_sums(kept) - own).clamp(min=0)
+            if span:
+                blurred = defocus.spread * _tiled(depth, part)[0]
+                depths += _by_defocus(seen, blurred - defocus.spread * sum(defocus.focus) / 2)
+                share = _farther(blurred, defocus.spread * nearest[part])
+                of_it = _per_tile(seen.square().sum(0) * share.to(seen), TILE) / _sums(seen).clamp(min=1e-30)
+                hidden += float((of_it * recorded[part]).sum())
+                behind += float(share.mean()) * recorded[part].numel() / recorded.numel()
         bands = torch.einsum("kl,kj,jl->l", spectra, gram, spectra).clamp(min=0).sqrt() * weights.abs().sum(0)
         level = math.sqrt(float(recorded.mean()) / (TILE * TILE * len(weights))) if recorded.numel() else 0.0
-        found.append(Survey(potential, recorded, blur, far, near, bands, depths.sqrt(), level))
+        hidden = math.sqrt(hidden / max(float(recorded.sum()), 1e-30))
+        found.append(Survey(potential, recorded, blur, far, near, bands, depths.sqrt(), level, hidden, behind))
     return found
 
 
@@ -185,6 +193,12 @@ def _behind(light: Tensor, blur: Tensor) -> Tensor:
         farther = torch.where(step > 0, energy.narrow(dim, 0, length), energy.narrow(dim, 1, length))
         found.narrow(dim, 1, length).add_(farther * step.abs())
     return _per_tile(found, TILE)
+
+
+def _farther(pixels: Tensor, nearest: Tensor) -> Tensor:
+    """What of pixels (H, W) lies farther than the nearest in tiles around (R, C): all of it from a pixel of blur on."""
+    around = nearest.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
+    return (around - pixels).clamp(0, 1)
 
 
 def _by_defocus(light: Tensor, pixels: Tensor) -> Tensor:

@@ -184,6 +184,14 @@ def test_hard_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> None:
     assert_inside(shot, light, (0.03, 0.003), text)
 
 
+def test_points_that_something_nearer_hides_are_not_overlooked() -> None:
+    """Not at an edge of depth, but near enough for its blur: of the random pairs."""
+    depth = ramp(1.3, 1.3, 64).clone()
+    depth[..., :30] = 0.35
+    light = Scene.builtin("point_grid", (64, 64)).with_depth(depth)
+    assert_inside(camera(diameter=6 * mm), light, (0.1, 0.01))
+
+
 @pytest.mark.parametrize("seed", ADVERSARIAL)
 def test_adversarial_pairs_stay_inside_the_tolerance(seed: int) -> None:
     """Real lenses over the field, measured PSFs, maps of pixels and rings with noise, narrow-band light."""
