@@ -5,8 +5,8 @@
 C are the cross-spectra of a scene's planes, in rings of frequency: mirrored at its borders, by a cosine transform, or
 dark there. H and G are transfer functions, of which slices through the middle suffice: light that runs more along x
 sees that along x. A^T A is what pixels record of each pair of bands, in their mean. With layers of depth each plane is
-split among them, without occlusion, and each layer has transfer functions of its own; where there are fewer, those of
-its neighbours.
+split among them, and each layer has transfer functions of its own; where there are fewer, those of its neighbours. What
+layers hide of each other is off by as much as their masks are in even light, times the light that may be hidden.
 """
 
 from __future__ import annotations
@@ -127,7 +127,9 @@ class Spectra:
         """Even light everywhere, in the same layers: what hides what is counted in it."""
         even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
         ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
-        return Spectra(self.imaging, ones, self.weights, picture=self.picture, wavelengths=self.wavelengths)
+        masks = Spectra(self.imaging, ones, self.weights, picture=self.picture, wavelengths=self.wavelengths)
+        masks._tables, masks._tabled = self._tables, self._tabled
+        return masks
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
