@@ -24,9 +24,9 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH, ROUND = 1.5, 0.8
+WORTH, ROUND = 1.6, 0.8
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and through a
-round lens, whose PSFs cost least to foretell: measured.
+round lens without rings, whose PSFs cost least to foretell: measured.
 """
 
 SENSOR = "sensor"
@@ -113,7 +113,9 @@ class Planner:
         imaging = self.evaluator.imaging
         if imaging is None or self.evaluator.varies:
             return False
-        return self.prices.of({})[0] > (ROUND if getattr(imaging.lens, "symmetric", False) else WORTH)
+        lens: Any = imaging.lens
+        smooth = getattr(lens, "symmetric", False) and not lens.has_rings
+        return self.prices.of({})[0] > (ROUND if smooth else WORTH)
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:
