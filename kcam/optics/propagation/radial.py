@@ -257,8 +257,7 @@ def ring_amplitude(query: Query, pupil: Pupil, quadrature: Tensor) -> tuple[Tens
 
 def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: float) -> Tensor:
     """Intensity on the pixels from the tabulated transform (2, Z, T) of one wavelength."""
-    per_pixel, _ = query.evaluation_grid(wavelength)
-    reaches = [math.ceil(per_pixel * half) for half in query.half_sides]
+    per_pixel, reaches = _reaches(query, wavelength)
     radii2, inverse = _lattice(*reaches, query.device)
     position = scale * torch.sqrt(radii2) * (query.pixel_pitch / per_pixel) / _TABLE_STEP
     low = torch.clamp(position.detach().floor().long() - 3, max=transformed.shape[-1] - 8)
@@ -268,6 +267,12 @@ def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: fl
         value = value + weight * transformed[..., torch.abs(low + tap)]  # U is even in t
     intensity = value.square().sum(0).to(query.dtype)  # (Z, radii)
     return query.pixels(per_pixel).of_quadrant(intensity[:, inverse].unflatten(-1, [reach + 1 for reach in reaches]))
+
+
+def _reaches(query: Query, wavelength: float) -> tuple[float, list[int]]:
+    """(points per pixel, points from the origin to the edges of the window along y, and x)."""
+    per_pixel, _ = query.evaluation_grid(wavelength)
+    return per_pixel, [math.ceil(per_pixel * half) for half in query.half_sides]
 
 
 @functools.lru_cache(maxsize=8)
@@ -288,8 +293,8 @@ def _error(query: Query) -> float:
 
 def lookup_cost(query: Query) -> float:
     """Operations of 40 for each point at which the intensity is evaluated."""
-    rows, columns = (half / query.half_pixels for half in query.half_sides)
-    return query.vergences.numel() * sum(40.0 * m * m * rows * columns for m in query.points_per_axis)
+    points = (math.prod(2 * reach + 1 for reach in _reaches(query, w)[1]) for w in query.wavelengths.tolist())
+    return query.vergences.numel() * 40.0 * sum(points)
 
 
 def _needs_symmetry(query: Query) -> str | None:
