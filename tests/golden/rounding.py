@@ -14,6 +14,7 @@ FACTORS = (
     ("psf *, float32", "d *", 30.0),
     ("gradients of camera *", "d *", 10.0),
     ("picture in float32*", "d *", 10.0),
+    ("picture *, filtered, float32", "d *", 20.0),
     ("camera thesis*", "d *", 10.0),
     ("plan *", "d *", 10.0),
     # nodes of rings are eigenvalues, times phases of hundreds of radians
