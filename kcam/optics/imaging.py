@@ -170,7 +170,7 @@ class Imaging(Stage):
         changed = Imaging.__new__(Imaging)
         super(Imaging, changed).__init__()
         vars(changed).update({name: value for name, value in vars(self).items() if name not in vars(changed)})
-        changed._modules = dict(self._modules)
+        vars(changed)["_modules"] = dict(vars(self)["_modules"])
         for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache"):
             setattr(changed, name, ValueCache())
         changed.accuracy = accuracy
