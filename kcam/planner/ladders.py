@@ -308,7 +308,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         counts = [n for n in counts if 3 * n <= view.bands]
     levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in counts]
     top = Level(f"{view.bands} PSFs", {}, view.bands)
-    yield Ladder("wavelengths", [*levels, top], beside, successive=not tabled, always=True)
+    yield Ladder("wavelengths", [*levels, top], beside, successive=view.computed and not tabled, always=True)
 
 
 def _rank(view: _View) -> Iterator[Ladder]:
