@@ -86,9 +86,9 @@ def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Te
     length = max(1, _FINER * _RINGS_AT_ONCE // steps)
     parts = list(zip(*(part.split(length, dim=-1) for part in (field, rho)), strict=True))
     if len(parts) == 1:
-        return _hankel(field, steps, rho), energy
+        return hankel(field, steps, rho), energy
     # the table of each part is built again in the backward pass, not kept
-    return torch.stack([checkpoint(_hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
+    return torch.stack([checkpoint(hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,8 @@ def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
     return _KERNELS.get((rho, count, step), lambda: build(count))[:, :steps]
 
 
-def _hankel(field: Tensor, steps: int, rho: Tensor) -> Tensor:
+def hankel(field: Tensor, steps: int, rho: Tensor) -> Tensor:
+    """2 pi sum_n field_n J0(t rho_n) of a field over rings (..., n) at t = 0, `_TABLE_STEP`, ..., (..., steps)."""
     coarse = math.ceil(steps / _FINER) + _SINC_TAPS
     return _refined(field @ hankel_kernel(rho, coarse, step=_FINER * _TABLE_STEP))[..., :steps]
 
