@@ -16,7 +16,7 @@ import math
 import random
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,12 +44,23 @@ RESULTS = Path(__file__).parent / "results" / "planner.json"
 
 def random_pair(seed: int, *, longest: float = LONGEST) -> tuple[Camera, Scene, str, int]:
     """A camera, a scene, what they are, and how many pairs were drawn before because they would have taken too long."""
-    for attempt in range(100):
-        draw = random.Random(f"{seed}/{attempt}")
+
+    def draw_pair(draw: random.Random) -> tuple[Camera, Scene, str]:
         camera, lens = random_camera(draw)
         scene, light = random_scene(draw)
-        if Planner(camera, scene).prices.of({})[0] <= longest:
-            return camera, scene, f"{lens}; {light}", attempt
+        return camera, scene, f"{lens}; {light}"
+
+    return first_within(longest, f"{seed}", draw_pair)
+
+
+def first_within(
+    longest: float, seed: str, draw_pair: Callable[[random.Random], tuple[Camera, Scene, str]]
+) -> tuple[Camera, Scene, str, int]:
+    """The first pair whose reference takes so long at most, predicted [s], and how many were drawn before."""
+    for attempt in range(100):
+        camera, scene, text = draw_pair(random.Random(f"{seed}/{attempt}"))
+        if Planner(camera, scene, one=True).prices.of({})[0] <= longest:
+            return camera, scene, text, attempt
     raise RuntimeError(f"seed {seed}: no pair within {longest:g} s in 100 draws.")
 
 
@@ -57,9 +68,7 @@ def random_camera(draw: random.Random) -> tuple[Camera, str]:
     """Aperture 1 to 10 mm, 50 mm focal length, focus 0.3 m to infinity, no DOE or one of up to 30 waves; a sensor."""
     diameter = 10 ** draw.uniform(0, 1) * mm
     focus = random_distance(draw)
-    elements: list[optics.Element] = [optics.CircularAperture(diameter)]
-    ideal = draw.random() < 0.3
-    elements.append(optics.ThinLens(50 * mm) if ideal else optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"))
+    elements = bare_lens(diameter, ideal=(ideal := draw.random() < 0.3))
     kind, waves = draw.choice(["none", "none", "zernike", "smooth map", "wrapped map"]), draw.uniform(0, 30)
     generator = torch.Generator().manual_seed(draw.randrange(2**31))
     if kind == "zernike":
@@ -67,9 +76,7 @@ def random_camera(draw: random.Random) -> tuple[Camera, str]:
         coefficients[:3] = 0
         elements.append(optics.ZernikeDOE(coefficients * waves / (2 * coefficients.abs().sum())))
     elif kind != "none":
-        side = draw.choice([64, 128, 200])
-        phase = smooth_field((side, side), scale=draw.choice([3, 5]), generator=generator)
-        phase = 2 * math.pi * waves * phase
+        phase = smooth_map(draw, waves, generator)
         elements.append(optics.DOE(torch.remainder(phase, 2 * math.pi) if kind == "wrapped map" else phase))
     lens = optics.Lens(*elements, focus_distance=focus)
     pitch = draw.choice([3, 4, 6]) * um
@@ -78,6 +85,18 @@ def random_camera(draw: random.Random) -> tuple[Camera, str]:
     text = f"{diameter / mm:.2g} mm, focus {focus:.2g} m, {'ideal' if ideal else 'BK7'}"
     text += "" if kind == "none" else f", {kind} of {waves:.2g} waves"
     return Camera(imaging, *stages), f"{text}, {pitch / um:g} um, {name}"
+
+
+def bare_lens(diameter: float, *, ideal: bool) -> list[optics.Element]:
+    """50 mm, ideal or of glass."""
+    glass = optics.ThinLens(50 * mm) if ideal else optics.PlanoConvexLens(25.8 * mm, glass="N-BK7")
+    return [optics.CircularAperture(diameter), glass]
+
+
+def smooth_map(draw: random.Random, waves: float, generator: torch.Generator) -> Tensor:
+    """A phase of few periods across, in 64 to 200 pixels [rad]."""
+    side = draw.choice([64, 128, 200])
+    return 2 * math.pi * waves * smooth_field((side, side), scale=draw.choice([3, 5]), generator=generator)
 
 
 def random_sensor(draw: random.Random) -> tuple[list[torch.nn.Module], str]:
@@ -151,21 +170,20 @@ def hard_pair(seed: int, *, sides: tuple[int, ...] = HARD_SIDES) -> tuple[Camera
     """As `random_pair`, of what a plan could overlook: lamps out of focus, batches with one item unlike the others,
     saturation, depth edges in colour, hot pixels, wrapped radial profiles; the larger pictures with fewer items.
     """
-    for attempt in range(100):
-        draw = random.Random(f"hard/{seed}/{attempt}")
+
+    def draw_pair(draw: random.Random) -> tuple[Camera, Scene, str]:
         camera, lens = hard_camera(draw)
         scene, light = hard_scene(draw, sides)
-        if Planner(camera, scene).prices.of({})[0] <= LONGEST:
-            return camera, scene, f"{lens}; {light}", attempt
-    raise RuntimeError(f"seed {seed}: no pair within {LONGEST:g} s in 100 draws.")
+        return camera, scene, f"{lens}; {light}"
+
+    return first_within(LONGEST, f"hard/{seed}", draw_pair)
 
 
 def hard_camera(draw: random.Random) -> tuple[Camera, str]:
     """A lens of 50 mm that is open to 3 to 8 mm, with a wrapped radial profile now and then; a sensor."""
     diameter, focus = draw.uniform(3, 8) * mm, 1 / draw.uniform(0.1, 1.5)
-    elements: list[optics.Element] = [optics.CircularAperture(diameter)]
     ideal, radial = draw.random() < 0.5, draw.random() < 0.25
-    elements.append(optics.ThinLens(50 * mm) if ideal else optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"))
+    elements = bare_lens(diameter, ideal=ideal)
     waves = draw.uniform(1, 8)
     if radial:
         profile = 2 * math.pi * waves * torch.linspace(0, 1, draw.choice([101, 201]), dtype=torch.float64)
@@ -246,8 +264,8 @@ def adversarial_pair(seed: int, *, sides: tuple[int, ...] = HARD_SIDES) -> tuple
     """As `hard_pair`, through what no estimate was made for: wrapped and noisy maps of pixels, rings with noise, real
     lenses over the field, measured PSFs; in narrow-band light now and then.
     """
-    for attempt in range(100):
-        draw = random.Random(f"adversarial/{seed}/{attempt}")
+
+    def draw_pair(draw: random.Random) -> tuple[Camera, Scene, str]:
         optic, name = adversarial_optics(draw)
         varies = isinstance(optic, optics.CompoundLens)
         scene, light = hard_scene(draw, [side for side in sides if side <= 192] if varies else sides)
@@ -262,9 +280,9 @@ def adversarial_pair(seed: int, *, sides: tuple[int, ...] = HARD_SIDES) -> tuple
         border = draw.choice(["reflect", "reflect", "replicate", "zero"])
         stages, other = random_sensor(draw)
         camera = Camera(optics.Imaging(optic, pixel_pitch=draw.choice([3, 4, 6]) * um, border=border), *stages)
-        if Planner(camera, scene, one=True).prices.of({})[0] <= UNKIND:
-            return camera, scene, f"{name}, {other}; {light}", attempt
-    raise RuntimeError(f"seed {seed}: no pair within {UNKIND:g} s in 100 draws.")
+        return camera, scene, f"{name}, {other}; {light}"
+
+    return first_within(UNKIND, f"adversarial/{seed}", draw_pair)
 
 
 def adversarial_optics(draw: random.Random) -> tuple[optics.Lens | optics.CompoundLens | optics.MeasuredPSF, str]:
@@ -278,17 +296,15 @@ def adversarial_optics(draw: random.Random) -> tuple[optics.Lens | optics.Compou
     if kind == "measured PSFs":
         return measured_psfs(draw, generator)
     diameter = draw.uniform(1, 8) * mm
-    parts: list[optics.Element] = [optics.CircularAperture(diameter)]
-    parts.append(optics.ThinLens(50 * mm) if draw.random() < 0.5 else optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"))
+    parts = bare_lens(diameter, ideal=draw.random() < 0.5)
     noise = draw.choice([0.0, 0.1, 1.0])
     if kind == "noisy rings":
         profile = 2 * math.pi * waves * torch.linspace(0, 1, draw.choice([51, 201]), dtype=torch.float64) ** 2
         profile = profile + noise * torch.randn(len(profile), generator=generator, dtype=torch.float64)
         parts.append(optics.RadialDOE(torch.remainder(profile, 2 * math.pi)))
     else:
-        side = draw.choice([64, 128, 200])
-        phase = 2 * math.pi * waves * smooth_field((side, side), scale=draw.choice([3, 5]), generator=generator)
-        phase = phase + noise * torch.randn(side, side, generator=generator, dtype=torch.float64)
+        phase = smooth_map(draw, waves, generator)
+        phase = phase + noise * torch.randn(phase.shape, generator=generator, dtype=torch.float64)
         parts.append(optics.DOE(torch.remainder(phase, 2 * math.pi) if kind == "wrapped map" else phase))
     text = f"{diameter / mm:.2g} mm, focus {focus:.2g} m, {kind} of {waves:.2g} waves and {noise:g} rad of noise"
     return optics.Lens(*parts, focus_distance=focus), text

@@ -282,8 +282,9 @@ class Lens(ElementStack):
         if self.has_pixel_phase:
             maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
             counts = [samples_by_rule(query, index) for index in range(len(query.wavelengths))]
-            tau = 0.0 if row.paraxial else float(query.tau.detach())
-            found["map"] = sum(maps + (warp_terms(count, tau) * count**2 if tau else 0.0) for count in counts)
+            tau = float(query.tau.detach())
+            warps = (0.0 if row.paraxial else warp_terms(count, tau) * count**2 for count in counts)
+            found["map"] = sum(maps + warp for warp in warps)
         return found
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:

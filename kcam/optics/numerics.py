@@ -92,13 +92,10 @@ class BesselJ1(torch.autograd.Function):
 def lagrange(offset: Any, *, taps: range) -> list[Any]:
     """Weights of the Lagrange polynomial through the taps at `offset`, a tensor or an array."""
     off = [offset - tap for tap in taps]
-    below, above = list(accumulate(off, mul)), list(accumulate(reversed(off), mul))
-    weights = []
-    for index, tap in enumerate(taps):
-        scale = 1 / math.prod(tap - other for other in taps if other != tap)
-        others = [*below[index - 1 : index], *above[len(off) - 2 - index : len(off) - 1 - index]]
-        weights.append(math.prod(others, start=scale))
-    return weights
+    below = accumulate(off[:-1], mul, initial=1.0)
+    above = reversed([*accumulate(off[:0:-1], mul, initial=1.0)])
+    apart = (math.prod(tap - other for other in taps if other != tap) for tap in taps)
+    return [low * high / scale for low, high, scale in zip(below, above, apart, strict=True)]
 
 
 def bracketed(nodes: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:

@@ -65,8 +65,8 @@ class Ladder:
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
-    always: whether it is told of and climbed without asking whether its foot saves time; urgency: how much more its
-    error counts than others' where the next ladder to climb is chosen.
+    doubtful: whether it is left out where its foot saves no time; urgency: how much more its error counts than others'
+    where the next ladder to climb is chosen.
     """
 
     effect: str
@@ -77,7 +77,7 @@ class Ladder:
     alternatives: Callable[[Level], list[Level]] | None = None
     follows: Ladder | None = None
     settled: float = math.inf
-    always: bool = False
+    doubtful: bool = False
     urgency: float = 1.0
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
@@ -267,7 +267,7 @@ def _blur(view: _View) -> Iterator[Ladder]:
     levels = [Level("none", {"blur": False}), Level(label, {})]
     if view.trained:
         levels = levels[1:]  # a parameter of the lens that trains acts through it
-    yield Ladder("diffraction", levels, view.beside, blurs=False, always=True)
+    yield Ladder("diffraction", levels, view.beside, blurs=False)
 
 
 def _model(view: _View) -> Iterator[Ladder]:
@@ -276,7 +276,7 @@ def _model(view: _View) -> Iterator[Ladder]:
     """
     if view.stand_in and not view.one:
         beside = {name: value for name, value in view.few().items() if name not in PARAXIAL}
-        yield Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside)
+        yield Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside, doubtful=True)
 
 
 def _sampling(view: _View) -> Iterator[Ladder]:
@@ -291,14 +291,14 @@ def _sampling(view: _View) -> Iterator[Ladder]:
         return
     own = imaging.accuracy.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
-    yield Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.beside)
+    yield Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.beside, doubtful=True)
 
 
 def _precision(view: _View) -> Iterator[Ladder]:
     precision = view.imaging.accuracy.precision
     if precision == "float64" or (precision is None and view.scene.dtype == torch.float64):
         levels = [Level("float32", {"precision": "float32"}), Level("float64", {})]
-        yield Ladder("precision", levels, view.beside)
+        yield Ladder("precision", levels, view.beside, doubtful=True)
 
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
@@ -308,7 +308,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         counts = [n for n in counts if 3 * n <= view.bands]
     levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in counts]
     top = Level(f"{view.bands} PSFs", {}, view.bands)
-    yield Ladder("wavelengths", [*levels, top], beside, successive=view.computed and not tabled, always=True)
+    yield Ladder("wavelengths", [*levels, top], beside, successive=view.computed and not tabled)
 
 
 def _rank(view: _View) -> Iterator[Ladder]:
@@ -316,7 +316,7 @@ def _rank(view: _View) -> Iterator[Ladder]:
     own = view.scene.coefficients.shape[1]
     if view.scene.spectra is None and own > 1:
         levels = [Level(f"rank {rank}", {"rank": rank}, rank) for rank in RANKS if rank < own]
-        yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False})
+        yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False}, doubtful=True)
 
 
 def _depth(view: _View) -> Iterator[Ladder]:
@@ -327,11 +327,11 @@ def _depth(view: _View) -> Iterator[Ladder]:
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in LAYERS if n < view.layers]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=False)
-    layers = Ladder("depth", [*levels, top], beside, successive=True, always=True)
+    layers = Ladder("depth", [*levels, top], beside, successive=True)
     yield layers
     if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
-        yield Ladder("occlusion", levels, beside, follows=layers, settled=HIDING, always=True)
+        yield Ladder("occlusion", levels, beside, follows=layers, settled=HIDING)
 
 
 def _support(view: _View) -> Iterator[Ladder]:
@@ -347,7 +347,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled, always=True)
+    yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled)
 
 
 def _field(view: _View) -> Iterator[Ladder]:
@@ -373,7 +373,7 @@ def _field(view: _View) -> Iterator[Ladder]:
     foot = [] if view.trained else [Level("1 PSF", {"field_variation": False}, 1)]
     if not imaging.accuracy.field_variation:
         levels, foot = [Level("1 PSF", {}, 1)], []
-    variation = Ladder("field variation", [*foot, *levels], beside, always=True)
+    variation = Ladder("field variation", [*foot, *levels], beside)
     yield variation
     few = view.few()
     for effect, size, follows in (
@@ -387,7 +387,7 @@ def _field(view: _View) -> Iterator[Ladder]:
             levels = [Level("none", {})]
         elif view.trained:
             levels = levels[1:]
-        yield Ladder(effect, levels, beside if follows else few, follows=follows, always=True, urgency=URGENT)
+        yield Ladder(effect, levels, beside if follows else few, follows=follows, urgency=URGENT)
 
 
 LADDERS: Sequence[Callable[[_View], Iterator[Ladder]]] = (

@@ -199,7 +199,7 @@ class Planner:
         if self._known is None:
             prices = self.prices
             every = ladders(self.evaluator, prices.scene, seconds=lambda changes: prices.of(changes)[0], one=self.one)
-            steps = [ladder for ladder in every if ladder.always or self.prices.saves(ladder)]
+            steps = [ladder for ladder in every if not ladder.doubtful or self.prices.saves(ladder)]
             skips = [_Skip(self.camera, index, self.evaluator.signals) for index in self.evaluator.skippable()]
             self._known = steps, skips
         return self._known

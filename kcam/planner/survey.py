@@ -106,20 +106,20 @@ def survey(scene: Scene, camera: Camera, defocus: Defocus) -> list[Survey]:
             finer = _contrast(seen)
             finer_kept = _contrast(kept) if full else finer
             own = _at(finer_kept, blur[part])
+            blurred = defocus.spread * _tiled(depth, part)[0] if span else torch.zeros(())
             potential[:, part] = torch.stack(
                 [
                     own,
                     _at(finer, blur[part]),
                     _at(finer, torch.full_like(own, span)),
                     _at(finer, edge[part]),
-                    _behind(seen, defocus.spread * _tiled(depth, part)[0]) if span else torch.zeros_like(own),
+                    _behind(seen, blurred) if span else torch.zeros_like(own),
                     finer_kept[1],
                     _sums(seen - kept) if full else torch.zeros_like(own),
                 ]
             )
             recorded[part] = (_sums(kept) - own).clamp(min=0)
             if span:
-                blurred = defocus.spread * _tiled(depth, part)[0]
                 depths += _by_defocus(seen, blurred - defocus.spread * sum(defocus.focus) / 2)
                 share = _farther(blurred, defocus.spread * nearest[part])
                 of_it = _per_tile(seen.square().sum(0) * share.to(seen), TILE) / _sums(seen).clamp(min=1e-30)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
@@ -18,10 +19,11 @@ from kcam.optics.propagation.question import Query, radial_phase, residual_path
 from kcam.optics.propagation.rings import fewer_nodes, panel_nodes, panel_orders
 from kcam.optics.propagation.row import Propagator, Rate
 from kcam.optics.pupil.coordinates import Pupil, from_image_side
+from kcam.optics.pupil.rim import kaiser_sinc
 
 _TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
 _FINER = 6  # steps between those that are summed up: a disc of radius 1 has no frequency above 1
-_SINC_TAPS, _SINC_BETA = 12, 18.0  # on either side, and Kaiser's window: the steps between are then good to 1e-9
+_SINC_TAPS, _SINC_BETA = 12, 18.0  # on either side, and Kaiser's window: the steps between are then good to 4e-9
 _REFINED_AT_ONCE = 16
 _MOST_RINGS = 2**20
 _RINGS_AT_ONCE = 2**24  # entries of the Hankel table: 128 MB
@@ -33,7 +35,7 @@ _FEWEST, _PER_FRINGE = 256, 2  # frequencies in a table of transfer functions, i
 _BEYOND_RAYS = 80.0  # times what the rim diffracts beyond all, for transfer functions
 _TAIL = 64  # rings of what it diffracts farther
 _CUBIC = range(-1, 3)
-_EVERY = 3  # step of the Hankel table in the sum over the light: a quarter of the least that tells its frequencies
+_EVERY = 3  # step of the Hankel table in the sum over the light: half of the largest that tells its frequencies
 _NEAR_0 = (0.0947421, -0.0124339, 0.0010251)
 """Of f(t) t at 0, h and 2 h, beside the trapezium rule's weights: what Euler and Maclaurin add to it, to h^8."""
 LOOKUPS = Rate("radial", 1.5e-10)
@@ -218,11 +220,9 @@ def _refined(values: Tensor) -> Tensor:
 @torch.inference_mode(False)
 def _sinc_weights() -> Tensor:
     """What each of so many neighbours gives to `_REFINED_AT_ONCE` steps and those between them."""
-    between = torch.arange(_REFINED_AT_ONCE * _FINER, dtype=torch.float64) / _FINER
-    off = between - (torch.arange(_REFINED_AT_ONCE + 2 * _SINC_TAPS - 1, dtype=torch.float64) - _SINC_TAPS + 1)[:, None]
-    share = torch.sqrt((1 - (off / _SINC_TAPS) ** 2).clamp(min=0))
-    window = torch.special.i0(_SINC_BETA * share) / torch.special.i0(torch.full_like(share, _SINC_BETA))
-    return torch.where(off.abs() < _SINC_TAPS, torch.sinc(off) * window, 0.0)
+    between = np.arange(_REFINED_AT_ONCE * _FINER) / _FINER
+    off = between - np.arange(1 - _SINC_TAPS, _REFINED_AT_ONCE + _SINC_TAPS)[:, None]
+    return torch.as_tensor(kaiser_sinc(off, half_width=_SINC_TAPS, beta=_SINC_BETA))
 
 
 def ring_nodes(query: Query, frequency: float, *, density: float = 1.0) -> tuple[Tensor, Tensor]:
