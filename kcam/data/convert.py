@@ -15,7 +15,7 @@ import numpy as np
 
 from kcam.data.bands import resampled
 from kcam.data.cube import SUFFIX, CubeError, words_of, write_source
-from kcam.data.readers import SUFFIXES, open_source, scenes_in
+from kcam.data.readers import find_scenes, open_source
 from kcam.data.readers.format import Options, scene_name
 
 
@@ -38,10 +38,11 @@ class Conversion:
 
 @dataclass
 class Report:
-    """What came of each scene: facts of those that were written, reasons of those that failed."""
+    """What came of each scene: facts of those that were written, reasons of those that failed or were passed over."""
 
     written: dict[str, dict[str, Any]] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
 
 
 def convert(
@@ -61,21 +62,14 @@ def convert(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     how = how or Conversion()
-    report = Report()
+    found = find_scenes(inputs, apart=how.depths)
+    report = Report(failed=found.failed, skipped=found.skipped)
     jobs: dict[str, Path] = {}
-    for given in inputs:
-        try:
-            scenes = list(scenes_in(Path(given)))
-            if not scenes:
-                known = ", ".join(SUFFIXES)
-                report.failed[str(given)] = f"there is no scene in it: expected {known}, or a folder X_ms of PNGs."
-            for path in scenes:
-                name = scene_name(path)
-                first = jobs.setdefault(name, path)
-                if first is not path and first.resolve() != path.resolve():
-                    report.failed[str(path)] = f"another input is called {name} too: {first}."
-        except OSError as error:
-            report.failed[str(given)] = str(error)
+    for path in found.scenes:
+        name = scene_name(path)
+        first = jobs.setdefault(name, path)
+        if first is not path:
+            report.failed[str(path)] = f"another input is called {name} too: {first}."
     for path, facts in _run(list(jobs.values()), out, how, workers):
         if isinstance(facts, str):
             report.failed[str(path)] = " ".join(facts.split())

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcam import spectral
 from kcam.data.cube import Source
-from kcam.data.readers import open_source
+from kcam.data.readers import Options, open_source
 from kcam.isp import tone_curve
 from kcam.units import nm
 
@@ -67,12 +67,15 @@ class Findings:
         return found
 
 
-def inspect(path: Path) -> tuple[Findings, Tensor, np.ndarray]:
+def inspect(
+    path: Path, *, format: str | None = None, options: Options | None = None
+) -> tuple[Findings, Tensor, np.ndarray]:
     """Findings of a cube, a thumbnail (3,h,w) sRGB, and five spectra (5,L): the percentiles 5, 25, 50, 75 and 95.
 
+    Args:      format, options: as for `readers.open_source`.
     Raises:    CubeError, FileNotFoundError as `readers.read_cube`.
     """
-    source = open_source(path)
+    source = open_source(path, format=format, options=options)
     values, valid = _sample(source)
     bands = len(values)
     inside = values[:, valid] if valid.any() else values.reshape(bands, -1)

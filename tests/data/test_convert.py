@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ import typer
 import writers
 from typer.testing import CliRunner
 
+from kcam.cli import console
 from kcam.data import convert as module
 from kcam.data import parse_bands, read_cube
 from kcam.data.bands import resampling
@@ -90,8 +92,7 @@ def test_a_folder_without_scenes_is_a_failure(inside: tuple[str, ...], tmp_path:
 @pytest.mark.parametrize("name", sorted(path.stem for path in stores.TOOLS.glob("*_*.py")))
 def test_help_prints_what_was_written(name: str) -> None:
     """[m], [pixels] and kcam[dask] are no markup."""
-    tool = stores.tool(name)
-    app = stores.tool("common").command(tool.main)
+    app = console.command(stores.tool(name).main)
     printed = CliRunner().invoke(app, ["--help"]).output.replace("\u2502", " ")
     command: Any = typer.main.get_command(app)
     for sentence in (command.help, *(getattr(parameter, "help", None) for parameter in command.params)):
@@ -203,7 +204,8 @@ def test_folders_of_scenes_with_bad_ones_between_them(tmp_path: Path) -> None:
     assert sorted(path.stem for path in out.iterdir()) == sorted([*GOOD, "older"])
     assert (out / "older.tif").read_bytes() == b"of another day"
     np.testing.assert_allclose(read_cube(out / "toy_ms.tif").values.numpy(), writers.cube(31), atol=1e-5)  # 16 bits
-    lines = result.stderr.splitlines()
+    skipped, *lines = result.stderr.splitlines()
+    assert skipped.startswith(f"skipped: {folder / 'readme.txt'}: it is no cube: its name ends in none of .exr, .mat")
     assert [Path(line.split(": ")[1]).name for line in lines] == sorted(BAD, key=lambda n: str(next(folder.rglob(n))))
     assert all(line.startswith("failed: ") for line in lines)
     assert [line.split(":")[0] for line in result.stdout.splitlines()] == [
@@ -212,6 +214,7 @@ def test_folders_of_scenes_with_bad_ones_between_them(tmp_path: Path) -> None:
     document = json.loads(report.read_text())
     assert sorted(facts["name"] for facts in document["written"].values()) == GOOD
     assert sorted(Path(path).name for path in document["failed"]) == BAD
+    assert list(document["skipped"]) == [str(folder / "readme.txt")]
     harvard = next(facts for facts in document["written"].values() if facts["name"] == "img1")
     assert harvard["shape"] == [31, 12, 17]
     assert harvard["invalid"] == pytest.approx(10 / (12 * 17))  # lbl is 0 on 2 x 5 pixels
@@ -269,8 +272,9 @@ def test_two_inputs_of_one_name(tmp_path: Path) -> None:
         writers.npz(tmp_path / folder)
     first = tmp_path / "a" / "arr_cube_nm.npz"
     result = convert_cubes(tmp_path / "a", tmp_path / "b", first, "--out", tmp_path / "out", status=1)
-    assert result.stderr.count("\n") == 1  # the same file twice is no matter
-    assert "another input is called arr_cube_nm too" in result.stderr
+    skipped, failed = result.stderr.splitlines()  # the same file twice is no failure
+    assert skipped == f"skipped: {first}: it is named twice."
+    assert failed == f"failed: {tmp_path / 'b' / first.name}: another input is called arr_cube_nm too: {first}."
     assert len(list((tmp_path / "out").iterdir())) == 1
 
 
@@ -338,7 +342,7 @@ def test_two_workers_write_the_same_bytes(tmp_path: Path) -> None:
     for workers in (1, 2):
         done = _process(folder, "--out", tmp_path / str(workers), "--workers", workers)
         assert done.returncode == 1, done.stderr
-        assert len(done.stderr.splitlines()) == len(BAD)
+        assert len(re.findall(r"^failed: ", done.stderr, re.MULTILINE)) == len(BAD)
     for name in GOOD:
         assert (tmp_path / "1" / f"{name}.tif").read_bytes() == (tmp_path / "2" / f"{name}.tif").read_bytes()
 

@@ -1,4 +1,4 @@
-"""MATLAB: ICVL and ARAD-1K in version 7.3, which is HDF5; Harvard and the CASSI papers in version 5."""
+"""MATLAB: ICVL and ARAD-1K in version 7.3, which is HDF5; Harvard, the CASSI papers and any other in version 5."""
 
 from __future__ import annotations
 
@@ -13,56 +13,48 @@ import numpy as np
 
 from kcam.data.bands import profile
 from kcam.data.cube import CubeError, Source, check_promise, check_size, lacking
-from kcam.data.readers.format import Format, Options, array_source, in_metres, known_wavelengths, scaled, scene_name
+from kcam.data.readers.format import (
+    WAVELENGTHS,
+    Format,
+    Options,
+    array_source,
+    bands_first,
+    cube_array,
+    full_scale,
+    in_metres,
+    known_wavelengths,
+    may_be_wavelengths,
+    scaled,
+    scene_name,
+)
+from kcam.data.readers.hdf5 import array_in, h5py, is_matlab, wavelengths_in
 
 
-def _is_version(version: str, path: Path) -> bool:
+def _is_version_5(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.read(10) == f"MATLAB {version}".encode()
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError("MATLAB 7.3 files are HDF5, which the extra reads: pip install 'kcam[data]'.") from error
-    return h5py
+        return file.read(10) == b"MATLAB 5.0"
 
 
 def _is_hdf5(key: str, path: Path) -> bool:
-    if not _is_version("7.3", path):
+    if not is_matlab(path):
         return False
-    with _h5py().File(path, "r") as file:
+    with h5py().File(path, "r") as file:
         return {key, "bands"} <= set(file)
 
 
 def _open_hdf5(usual: str, divisor: float, path: Path, options: Options) -> Source:
     """An HDF5 array (L,W,H), the reverse of MATLAB's axes, with wavelengths beside it."""
-    h5py, key = _h5py(), options.key or usual
-    with h5py.File(path, "r") as file:
-        for name in (key, "bands"):
-            link = file.get(name, getlink=True)
-            if link is not None and not isinstance(link, h5py.HardLink):
-                raise CubeError(f"its {name!r} is a link to elsewhere, which is not followed.")
-        if key not in file:
-            raise lacking(f"array {key!r}", sorted(file))
-        array = file[key]
-        if not isinstance(array, h5py.Dataset) or array.ndim != 3 or array.dtype.kind not in "fui":
+    key = options.key or usual
+    with h5py().File(path, "r") as file:
+        array = array_in(file, key, path)
+        if array.ndim != 3:
             raise CubeError(f"its {key!r} is no array of numbers with three axes.")
-        if array.external or array.is_virtual:
-            raise CubeError(f"its {key!r} lies in other files, which are not opened.")
-        count, width, height = check_size(array.shape, f"its {key!r}")
-        stored = array.id.get_storage_size()
-        if not 0 < stored <= path.stat().st_size:
-            raise CubeError(f"its {key!r} is not in the file: {stored} bytes of {path.stat().st_size}.")
-        check_promise(array.nbytes, stored, f"its {key!r}")
-        bands = None
-        if "bands" in file and isinstance(file["bands"], h5py.Dataset) and file["bands"].size <= 10_000:
-            bands = in_metres(file["bands"][()])
+        count, width, height = array.shape
+        bands = wavelengths_in(file, "bands")
     grid = known_wavelengths(options, count, bands)
 
     def rows(first: int, last: int) -> tuple[np.ndarray, None]:
-        with h5py.File(path, "r") as file:
+        with h5py().File(path, "r") as file:
             return scaled(file[key][:, :, first:last].transpose(0, 2, 1), divisor), None
 
     facts = {"scaling": f"{key} / {divisor:g}", "orientation": "axes of MATLAB, reversed by HDF5, turned back"}
@@ -149,7 +141,7 @@ def _open_harvard(path: Path, options: Options) -> Source:
 
 
 def _is_harvard(path: Path) -> bool:
-    return _is_version("5.0", path) and {"ref", "lbl"} <= set(_arrays(path))
+    return _is_version_5(path) and {"ref", "lbl"} <= set(_arrays(path))
 
 
 _CVPR = {"citation": "Chakrabarti and Zickler, Statistics of real-world hyperspectral images, CVPR 2011"}
@@ -186,7 +178,37 @@ def _open_cassi(path: Path, options: Options) -> Source:
 
 
 def _is_cassi(path: Path) -> bool:
-    return _is_version("5.0", path) and not set(_CASSI_KEYS).isdisjoint(_arrays(path))
+    return _is_version_5(path) and not set(_CASSI_KEYS).isdisjoint(_arrays(path))
 
 
 CASSI = Format("cassi28", "MATLAB 5 with HSI, img_expand, data_slice, img or img_hs", _open_cassi, (".mat",), _is_cassi)
+
+
+_REAL = frozenset({"double", "single", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))})
+
+
+def _open_mat(path: Path, options: Options) -> Source:
+    """Any array of MATLAB 5, its wavelengths beside it or named; 8 and 16 bits over their largest, else as they are."""
+    from scipy.io import whosmat
+
+    found = {name: (shape, kind in _REAL) for name, shape, kind in whosmat(str(path))}
+    key, shape = cube_array(found, options)
+    rows = [name for name, (sizes, real) in found.items() if real and may_be_wavelengths(sizes)]
+    beside = next((name for name in WAVELENGTHS if name in rows), None)
+    own = None if beside is None else in_metres(_array(path, beside))
+    order, axes = bands_first(shape, options, own, key)
+    values = _array(path, key)
+    divisor = full_scale(values.dtype)
+    upright = (values[0] if values.ndim == 4 else values).transpose(axes)
+    how: dict[str, Any] = {"own": own, "divisor": divisor, "orientation": f"axes {order}"}
+    return array_source(path, options, upright, f"{key} / {divisor:g}", **how)
+
+
+MAT = Format(
+    "mat",
+    "any MATLAB 5: an array of three axes (`--key`, `--axes`), wavelengths beside it or named",
+    _open_mat,
+    (".mat",),
+    _is_version_5,
+    free=True,
+)

@@ -8,7 +8,7 @@ from typing import Any
 import tifffile
 
 from kcam.data.cube import CubeError, Source, check_promise, check_size
-from kcam.data.readers.format import Format, Options, array_source, bands_first, normalised
+from kcam.data.readers.format import Format, Options, array_source, full_scale
 
 
 def _open_tiff(path: Path, options: Options) -> Source:
@@ -30,9 +30,10 @@ def _open_tiff(path: Path, options: Options) -> Source:
         values = values[None]
     if values.ndim != 3 or values.dtype.kind not in "fui":
         raise CubeError(f"it holds {' x '.join(map(str, sizes))} of {values.dtype}, expected bands of numbers.")
-    values = values.transpose(2, 0, 1) if names.endswith("S") else bands_first(values, options.wavelengths)
-    values, divisor = normalised(values)
-    return array_source(path, options, values, f"/ {divisor:g}")
+    grid, divisor = options.wavelengths, full_scale(values.dtype)
+    if names.endswith("S") or (grid is not None and len(values) != len(grid) == values.shape[-1]):
+        values = values.transpose(2, 0, 1)
+    return array_source(path, options, values, f"/ {divisor:g}", divisor=divisor)
 
 
 def _is_stack(path: Path) -> bool:
