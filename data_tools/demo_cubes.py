@@ -7,9 +7,9 @@ from typing import Annotated
 
 import torch
 import typer
-from common import end, progress, run
 
 from kcam import Scene
+from kcam.cli.console import end, progress, run
 from kcam.data import Cube, write_cube
 
 SCENES = ("astronaut", "chelsea", "coffee", "colour_chart", "motorcycle", "star")
@@ -30,7 +30,7 @@ def main(
                 scene.bands()[0].clamp(min=0), scene.wavelengths, "relative radiance", None, depth, name, source
             )
             write_cube(out / f"{name}.tif", cube)
-            advance(name, len(SCENES))
+            advance(name)
     end({"cubes": list(SCENES)}, [f"{len(SCENES)} cubes in {out}"], as_json=False, failed={})
 
 

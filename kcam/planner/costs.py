@@ -92,18 +92,20 @@ def save_rates(rates: Mapping[str, float]) -> Path:
     return path
 
 
-def calibrate(*, rounds: int = 3, advance: Callable[[str], None] | None = None) -> tuple[dict[str, float], float]:
+def calibrate(*, rounds: int = 3, advance: Callable[[str, int], None] | None = None) -> tuple[dict[str, float], float]:
     """Measure this machine's rates: the least squares, without negative rates, of pictures of many kinds.
 
-    Args:      rounds: calls of each, of which the median counts.  advance: told what is being measured.
+    Args:      rounds: calls of each, of which the median counts.
+               advance: told what is being measured, and how many pictures there are.
     Returns:   (kind -> seconds for one operation, the median factor by which they mispredict those pictures).
     """
     from scipy.optimize import nnls  # imported late: few calibrate
 
     works, times = [], []
-    for name, imaging, scene, colours in _pictures():
+    pictures = list(_pictures())
+    for name, imaging, scene, colours in pictures:
         if advance is not None:
-            advance(name)
+            advance(name, len(pictures))
         found = []
         with torch.no_grad():
             for _ in range(rounds + 1):

@@ -40,7 +40,7 @@ def sweep(
     thorough: bool = False,
     knobs: Sequence[str] | None = None,
     seconds: float | None = None,
-    advance: Callable[[str], None] | None = None,
+    advance: Callable[[str, int], None] | None = None,
     title: str = "What accuracy costs",
 ) -> Sweep:
     """Turn every knob of a camera and measure error, time and memory, on one thread of the CPU.
@@ -48,7 +48,7 @@ def sweep(
     Args:      thorough: more settings, a larger window for the PSFs, and 15 minutes rather than 3.
                knobs: of `KNOBS`; None for all.
                seconds: to spend on timing in rounds after everything was computed once; None: what `thorough` says.
-               advance: told what is being done.
+               advance: told what is being done, and how many such steps there will be, as far as one can tell.
                title: of the table and the figure.
     Raises:    ValueError for a camera without optics, a scene that is not on the CPU, or optics for which the reference
                is not converged.
@@ -56,14 +56,14 @@ def sweep(
     if scene.device.type != "cpu":
         raise ValueError(f"the sweep measures the CPU, but the scene is on {scene.device}. Use scene.to('cpu').")
     started = time.monotonic()
-    advance = advance or (lambda what: None)
+    advance = advance or (lambda what, steps: None)
     every = settings(camera, scene, thorough=thorough, knobs=knobs)
     with torch.no_grad(), threads.fixed(1):
-        advance("reference")
+        advance("reference", 1 + 2 * len(every))
         truth = _Truth.of(camera, scene, window=THOROUGH_WINDOW if thorough else WINDOW)
         rows = []
-        for index, setting in enumerate(every):
-            advance(f"{index + 1} of {len(every)}, {setting.name}")
+        for setting in every:
+            advance(setting.name, 1 + 2 * len(every))
             rows.append(_measured(setting, truth, longest=THOROUGH_LONGEST if thorough else LONGEST))
         budget = (THOROUGH_SECONDS if thorough else SECONDS) if seconds is None else seconds
         deadline = time.monotonic() + seconds if seconds is not None else started + budget
@@ -228,17 +228,21 @@ def _delta_e(picture: Tensor, truth: Tensor) -> float | None:
     return float(deltaE_ciede2000(lab, other).mean())
 
 
-def _timed(every: Sequence[Setting], rows: list[Row], *, deadline: float, advance: Callable[[str], None]) -> list[Row]:
+def _timed(
+    every: Sequence[Setting], rows: list[Row], *, deadline: float, advance: Callable[[str, int], None]
+) -> list[Row]:
     """Time all settings by turns, A B A B, until the deadline; the first calls, with cold caches, do not count then."""
     times: list[list[float]] = [[] for _ in every]
     runs = [setting.camera.noiseless() for setting in every]
-    turn = 0
+    turn, began = 0, time.monotonic()
     while time.monotonic() < deadline:
         before = sum(map(len, times))
         for own, row, setting, camera in zip(times, rows, every, runs, strict=True):
             wanted = row.calls and (turn == 0 or (row.seconds or 0) < ONCE)
             if wanted and time.monotonic() + (row.seconds or 0) < deadline:
-                advance(f"round {turn + 1}, {setting.name}")
+                calls, now = sum(map(len, times)), time.monotonic()
+                more = max(1.0, calls * (deadline - now) / (now - began)) if calls else len(every)
+                advance(f"round {turn + 1}, {setting.name}", 1 + len(every) + calls + round(more))
                 fresh = with_imaging(camera)
                 own.append(measure.cpu_time(functools.partial(_shot, fresh, setting.scene)))
         if sum(map(len, times)) == before:

@@ -196,7 +196,7 @@ class Trap:
 def test_what_is_no_split_is_an_error(store: Path, tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"Open one of its splits: .*train, .*val"):
         PatchDataset(store)
-    with pytest.raises(FileNotFoundError, match="Make one with extract_patches"):
+    with pytest.raises(FileNotFoundError, match="Make one with kcam data extract"):
         PatchDataset(tmp_path)
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(StoreError, match="is damaged"):

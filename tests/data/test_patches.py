@@ -23,7 +23,8 @@ from stores import BANDS, HEIGHT, NAMES, SETTINGS, WIDTH, call, content, cube, m
 import kcam
 from kcam.data import PatchDataset, Settings, StoreError, extract, make_plan, verify, write_cube
 from kcam.data.cube import CubeError
-from kcam.data.patches import StoreStopped, group_of, parse_split, positions, read_manifest, scene, split_of
+from kcam.data.patches import StoreStopped, group_of, parse_split, positions, read_manifest, split_of
+from kcam.data.patches import plan as planning
 from kcam.data.patches.manifest import digest
 
 
@@ -410,7 +411,7 @@ def test_shards_in_any_order_make_the_same_bytes(cubes: Path, store: Path, tmp_p
 
 def test_resume_completes_shards_that_never_ran(cubes: Path, store: Path, tmp_path: Path):
     extract_tool(cubes, tmp_path / "out", "--shard", "2/4")
-    assert verify(tmp_path / "out")[0].endswith("is not finished: go on with extract_patches --resume.")
+    assert verify(tmp_path / "out")[0].endswith("is not finished: go on with kcam data extract --resume.")
     extract_tool(cubes, tmp_path / "out", "--resume")
     assert content(tmp_path / "out") == content(store)
 
@@ -491,7 +492,7 @@ def test_a_full_disk_stops_and_resume_goes_on(cubes: Path, store: Path, tmp_path
 
 def fail_to_read(name: str, error: Exception, patch: pytest.MonkeyPatch) -> None:
     """The rows of this scene raise an error."""
-    opened = scene.open_cube
+    opened = planning.open_cube
 
     def broken(path: Path):
         source = opened(path)
@@ -501,7 +502,7 @@ def fail_to_read(name: str, error: Exception, patch: pytest.MonkeyPatch) -> None
 
         return replace(source, rows=rows) if path.stem == name else source
 
-    patch.setattr(scene, "open_cube", broken)
+    patch.setattr(planning, "open_cube", broken)
 
 
 def test_a_disk_that_cannot_be_read_fails_the_scene_alone(cubes: Path, tmp_path: Path, monkeypatch):

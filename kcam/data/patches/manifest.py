@@ -147,7 +147,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.is_file():
         splits = sorted(str(found.parent) for found in folder.glob(f"*/{MANIFEST}"))
-        fix = f" Open one of its splits: {', '.join(splits)}." if splits else " Make one with extract_patches."
+        fix = f" Open one of its splits: {', '.join(splits)}." if splits else " Make one with kcam data extract."
         raise FileNotFoundError(f"there is no {MANIFEST} in {folder}.{fix}")
     held = path.read_bytes()
     how: dict[str, Any] = {"wrong": f"{path} is damaged", "error": StoreError, "hook": None}

@@ -8,8 +8,8 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ def parse_split(text: str) -> tuple[tuple[str, float], ...]:
 
 @dataclass(frozen=True)
 class SceneJob:
-    """A scene of a plan: where it is, what its header said, and a fingerprint of its file."""
+    """A scene of a plan: where it is, what its header said, a fingerprint of its file, and what opens it."""
 
     name: str
     path: str
@@ -86,16 +86,18 @@ class SceneJob:
     shape: tuple[int, int, int]
     bytes: int
     fingerprint: str
+    open: Callable[[Path], Source] = open_cube
 
 
 @dataclass(frozen=True)
 class StorePlan:
-    """What a store will hold. failed: inputs that cannot be part of it, and why."""
+    """What a store will hold. failed: inputs that cannot be part of it, and why. skipped: what is no input, and why."""
 
     settings: Settings
     wavelengths: tuple[float, ...]
     scenes: tuple[SceneJob, ...]
     failed: dict[str, str] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
 
     @property
     def hash(self) -> str:
@@ -146,21 +148,33 @@ def group_of(name: str, facts: dict[str, Any], pattern: str | None) -> str:
     return str(facts.get("group", name))
 
 
-def make_plan(cubes: str | os.PathLike[str], settings: Settings) -> StorePlan:
+Readers = Mapping[str, Callable[[Path], Source]]
+"""What opens files that are no cube files, by the ending of their name; another process can be sent it."""
+
+
+def make_plan(
+    cubes: str | os.PathLike[str], settings: Settings, *, readers: Readers | None = None, told: str = ""
+) -> StorePlan:
     """Plan a store from a folder of cube files, from their headers alone.
 
+    Args:      cubes: or one file.  readers: of other files there.
+               told: what the readers were told, which decides the bytes as much as a file does.
     Raises:    StoreError where there is no cube to read.
     """
     cubes = Path(cubes)
-    paths = sorted(cubes.glob(f"*{SUFFIX}")) if cubes.is_dir() else [cubes]
-    paths = [path for path in paths if not path.name.startswith(".")]
+    opened: Readers = {SUFFIX: open_cube, **(readers or {})}
+    paths, skipped = _inputs(cubes, opened) if cubes.is_dir() else ([cubes], {})
     if not paths:
-        raise StoreError(f"there are no cubes ({SUFFIX}) in {cubes}. Make some with data_tools/convert_cubes.py.")
+        raise StoreError(f"there are no cubes ({', '.join(opened)}) in {cubes}. Make some with kcam data convert.")
     sources: dict[str, tuple[Path, Source]] = {}
     failed: dict[str, str] = {}
     for path in paths:
+        if path.stem in sources or path.stem in failed:
+            failed[path.name] = f"another file here is called {path.stem} too."
+            continue
         try:
-            sources[path.stem] = (path, open_cube(path))
+            source = opened.get(path.suffix.lower(), open_cube)(path)
+            sources[path.stem] = (path, replace(source, rows=_unread))  # an array in memory would stay there
         except (CubeError, OSError) as error:
             failed[path.stem] = str(error)
         except Exception as error:
@@ -179,14 +193,37 @@ def make_plan(cubes: str | os.PathLike[str], settings: Settings) -> StorePlan:
         elif re.search(r"[\\\x00-\x1f\ud800-\udfff]", name + group):
             failed[name] = f"its name {name!r} cannot be that of a file everywhere. Rename it."
         else:
-            split, place = split_of(group, settings.split), str(path.resolve())
-            jobs.append(SceneJob(name, place, group, split, source.shape, path.stat().st_size, _fingerprint(path)))
-    return StorePlan(settings, grid, tuple(sorted(jobs, key=lambda job: job.name)), failed)
+            split, place, size = split_of(group, settings.split), str(path.resolve()), path.stat().st_size
+            opening = opened.get(path.suffix.lower(), open_cube)
+            mark = fingerprint(path, told=told if opening is not open_cube else "")
+            jobs.append(SceneJob(name, place, group, split, source.shape, size, mark, opening))
+    return StorePlan(settings, grid, tuple(sorted(jobs, key=lambda job: job.name)), failed, skipped)
 
 
-def _fingerprint(path: Path) -> str:
-    """Of 16 blocks of a file, its first and last among them: tells another cube of the same size without reading it."""
-    size, digest = path.stat().st_size, hashlib.sha256()
+def _inputs(folder: Path, readers: Readers) -> tuple[list[Path], dict[str, str]]:
+    """The files of a folder that are opened, and what else is in it, with the reason; nothing of what is hidden."""
+    paths, skipped = [], {}
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if path.suffix.lower() in readers:
+            paths.append(path)
+        else:
+            what = "a folder, which is not entered" if path.is_dir() else "no cube"
+            skipped[path.name] = f"it is {what}: expected files that end in {', '.join(readers)}."
+    return paths, skipped
+
+
+def _unread(first: int, last: int) -> tuple[np.ndarray, np.ndarray | None]:
+    raise CubeError(f"rows {first} to {last} are not read while a store is planned.")
+
+
+def fingerprint(path: Path, *, told: str = "") -> str:
+    """Of 16 blocks of a file, its first and last among them: tells another cube of the same size without reading it.
+
+    told: what else decides what is read of it.
+    """
+    size, digest = path.stat().st_size, hashlib.sha256(told.encode())
     with path.open("rb") as file:
         for place in range(16):
             file.seek(max(0, size - 4096) * place // 15)

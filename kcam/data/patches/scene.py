@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kcam.data.cube import NOTHING_VALID, CubeError, Source, open_cube
+from kcam.data.cube import NOTHING_VALID, CubeError, Source
 from kcam.data.patches.manifest import HEADER, sha256
 from kcam.data.patches.plan import SceneJob, Settings, StoreError, positions, starts
 from kcam.files import replacing
@@ -18,7 +18,7 @@ TOP = 65535
 
 def extract_scene(job: SceneJob, settings: Settings, folder: Path) -> dict[str, Any]:
     """Write the patches of one scene; returns its record for the manifest. No more than a few strips are in memory."""
-    source = open_cube(Path(job.path))
+    source = job.open(Path(job.path))
     if source.shape != job.shape:
         raise CubeError(f"it is {source.shape} now and was {job.shape} when the store was planned.")
     bands, height, width = source.shape

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,20 @@ from kcam.data.patches.manifest import MANIFEST, WORK, read_manifest, scene_arra
 from kcam.data.patches.plan import StoreError, split_of
 
 
-def verify(store: str | os.PathLike[str]) -> list[str]:
+def verify(store: str | os.PathLike[str], *, advance: Callable[[str, int], None] | None = None) -> list[str]:
     """What is wrong with a store, or with one split of it, a line each; nothing where all files are as written.
 
     Every file against its sha256, none missing and none too many (but run logs, *.log), all splits there and of one
     plan, every group of scenes in the split that its name's hash says and in no other.
+
+    Args:      advance: told of each scene that was read, and how many there are.
     """
     store = Path(store)
     one = (store / MANIFEST).is_file()
     folders = [store] if one else sorted(path.parent for path in store.glob(f"*/{MANIFEST}"))
     problems = []
     if (store / WORK).exists():
-        problems.append(f"{store} is not finished: go on with extract_patches --resume.")
+        problems.append(f"{store} is not finished: go on with kcam data extract --resume.")
     if not folders:
         return [*problems, f"{store} holds no {MANIFEST}: it is no patch store."]
     groups: dict[str, str] = {}
@@ -32,6 +35,7 @@ def verify(store: str | os.PathLike[str]) -> list[str]:
             documents[folder] = read_manifest(folder)
         except (StoreError, OSError) as error:
             problems.append(str(error))
+    count = sum(len(document["scenes"]) for document in documents.values())
     for folder, document in documents.items():
         split, shares = document["split"], document["settings"]["split"]
         if not one and split != folder.name:
@@ -45,6 +49,8 @@ def verify(store: str | os.PathLike[str]) -> list[str]:
             elif split_of(group, shares) != split:
                 problems.append(f"the group {group} stands in {split} and belongs to {split_of(group, shares)}.")
             problems += _file_problems(folder, document, record)
+            if advance is not None:
+                advance(record["scene"], count)
     if not one:
         expected = {name for document in documents.values() for name, _ in document["settings"]["split"]}
         missing = sorted(name for name in expected if not (store / name / MANIFEST).is_file())

@@ -1,4 +1,4 @@
-"""The command `kcam`: demo, shoot, psf, lens, explain, calibrate, tradeoff, train, paint.
+"""The command `kcam`: demo, shoot, psf, lens, explain, calibrate, tradeoff, train, paint, data.
 
 Only here are quantities strings with units.
 """
@@ -8,23 +8,22 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from kcam import __version__, memory
+from kcam.cli.console import complain, err, losses, one_line_errors, progress
+from kcam.cli.data import app as data_app
 
 if TYPE_CHECKING:
     from kcam.camera import Camera
     from kcam.optics import CompoundLens
     from kcam.scene import Scene
-    from kcam.style import Progress as StepProgress
+    from kcam.style import Progress
 
 UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 app = typer.Typer(
@@ -33,7 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "rich" would take [pixels] for a style, and drop it
 )
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+app.add_typer(data_app, name="data")
 
 TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; 0: the reference physics'
 FeaturesOption = Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")]
@@ -130,35 +129,6 @@ def open_lens(name: str, *, focus: str) -> CompoundLens:
     )
 
 
-@contextmanager
-def one_line_errors() -> Iterator[None]:
-    """What the user got wrong is one clear line and exit status 2; what we got wrong stays a traceback."""
-    try:
-        yield
-    except (ValueError, TypeError, OSError) as error:
-        complain(str(error))
-        raise typer.Exit(2) from error
-
-
-def complain(text: str) -> None:
-    """One line on the standard error."""
-    err.print("[bold red]kcam:[/] ", end="")
-    err.print(" ".join(text.split()), markup=False)
-
-
-@contextmanager
-def progress(description: str, *, total: int | None = None) -> Iterator[Callable[[str], None]]:
-    """A bar on the terminal's standard error; gives a function that says what is being done and moves the bar on."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(description, total=total)
-
-        def advance(what: str) -> None:
-            bar.update(task, advance=1, description=f"{description}: {what}")
-
-        yield advance
-
-
 def _version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"kcam {__version__}")
@@ -183,7 +153,7 @@ def demo(
     with one_line_errors():
         from kcam import demo as module
 
-        with progress("demo", total=module.STEPS) as advance:
+        with progress("demo", module.STEPS) as advance:
             paths = module.run(out, seed=seed, advance=advance)
         for path in paths:
             typer.echo(path)
@@ -221,7 +191,7 @@ def shoot(
         }
         pairs = module.outputs(photos, out)
         failed = []
-        with progress("shoot", total=len(pairs)) as advance:
+        with progress("shoot", len(pairs)) as advance:
             for photo, target in pairs:
                 try:
                     plan = module.shoot(stages, photo, target, **how)
@@ -475,13 +445,17 @@ def train(
             device=device,
         )
         leads = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun starts, one speaks
-        with training_progress() as advance:
+        with progress("step") as advance:
+
+            def one(step: Progress, steps: int) -> None:
+                advance(losses(step.terms), steps, done=step.step)
+
             try:
                 trained = module.run(
                     options,
                     resume=resume,
                     threads=threads or None,
-                    advance=advance if leads else None,
+                    advance=one if leads else None,
                     say=lambda text: err.print(text, markup=False) if leads else None,
                 )
             except TrainingError as error:
@@ -494,34 +468,6 @@ def train(
             typer.echo(f"{out}\n{out.with_suffix('')}/report.html")
         if not trained.finished:
             raise typer.Exit(3)
-
-
-@contextmanager
-def training_progress() -> Iterator[Callable[..., None]]:
-    """Terms of the loss and the time left: a bar on a terminal, else a line every so often."""
-    from kcam.plots import duration
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task("train", total=None)
-        first: list[tuple[int, float]] = []
-
-        def advance(progress: StepProgress, steps: int) -> None:
-            if not first:
-                first.append((progress.step, progress.seconds))
-            terms = "  ".join(f"{name} {value:.3f}" for name, value in progress.terms.items())
-            bar.update(task, completed=progress.step, total=steps, description=f"step {progress.step}: {terms}")
-            done = progress.step - first[0][0]
-            if done > 0 and (done == 5 or progress.step % 50 == 0):
-                each = (progress.seconds - first[0][1]) / done
-                left = duration(each * (steps - progress.step))
-                whole = duration(each * steps)
-                if done == 5:
-                    err.print(f"{each:.3g} s a step: {steps} steps take {whole}")
-                if not err.is_terminal and progress.step % 50 == 0 and progress.step < steps:
-                    err.print(f"step {progress.step} of {steps}, {left} left:  {terms}", markup=False)
-
-        yield advance
 
 
 @app.command()
@@ -554,7 +500,7 @@ def paint(
         layers = train.style_features(features, vgg_weights or None)
         loss = StyleLoss(picture, features=layers, content=content if photo else 0.0, colour=1.0)
         shown = train.shrunk(read_picture(photo).expand(3, -1, -1), size) if photo else None
-        with progress("paint", total=steps) as advance:
+        with progress("step", steps) as advance:
             painted = optimise(
                 loss,
                 photo=shown,
@@ -562,7 +508,7 @@ def paint(
                 start=start or None,
                 steps=steps,
                 seed=seed,
-                advance=lambda step, terms: advance("  ".join(f"{name} {value:.3f}" for name, value in terms.items())),
+                advance=lambda _, terms: advance(losses(terms)),
             )
         plots.write_picture(painted, out)
         typer.echo(out)
