@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,17 @@ _STANDARD = 10.0  # deviations: no picture that is normalised by mean and deviat
 Channels = tuple[int, ...] | None
 Code = tuple[str, str]
 """What an input probably is (or nothing), and the code that makes of it what a door takes (or nothing)."""
+MOST_NAMED = 10
+
+
+def named(word: str, reasons: Mapping[str, str], *, rest: str = "") -> list[str]:
+    """Lines that name files and the reason, "skipped: a.jpg: it is no picture": the first ten, and how many more.
+
+    Args:      rest: where the others are named, such as "--json".
+    """
+    lines = [f"{word}: {name}: {reason}" for name, reason in sorted(reasons.items())[:MOST_NAMED]]
+    more = len(reasons) - len(lines)
+    return lines + [f"{word}: and {more} more{rest and f', which {rest} names'}"] * (more > 0)
 
 
 # ---- pictures and cubes -------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from kcam import __version__, files, isp, plots, report, style
 from kcam.camera import Camera
+from kcam.inputs import named
 from kcam.plain import from_json
 from kcam.scene import Scene, read_picture
 from kcam.style.processes import place, told_by_the_first
@@ -36,15 +37,17 @@ class Options:
     """What a user chooses; `None` leaves it to the preset.
 
     style: a picture's path, or the name of one of `kcam.style.STYLES`. out: the camera to write, .safetensors; beside
-    it stands a folder of its name with checkpoints, pictures and the report. patches: a patch store; None: the built-in
-    scenes. camera: a saved one to start from. features: "steerable" or "vgg16", with vgg_weights. stage: False takes
-    the style stage off. style_size: longer side that the style is shrunk to; None: as it is.
+    it stands a folder of its name with checkpoints, pictures and the report. patches: a patch store; photos: a folder
+    of photographs; neither: the built-in scenes. camera: a saved one to start from. features: "steerable" or "vgg16",
+    with vgg_weights. stage: False takes the style stage off. style_size: longer side that the style is shrunk to; None:
+    as it is.
     """
 
     style: str
     out: str = "styled.safetensors"
     preset: str = "quick"
     patches: str | None = None
+    photos: str | None = None
     camera: str | None = None
     features: str = "steerable"
     vgg_weights: str | None = None
@@ -111,7 +114,13 @@ def run(
         raise ValueError(f'unknown preset "{options.preset}"; there are: {", ".join(style.PRESETS)}.')
     picture = style_picture(options.style, size=options.style_size)
     features = style_features(options.features, options.vgg_weights)
+    preset = style.PRESETS[options.preset]
+    source = _source(options, preset)
     document: dict[str, Any] = {"options": asdict(options), "style": _hash(picture)}
+    if isinstance(source, style.PhotoScenes):
+        document["photos"] = source.mark
+        for line in named("skipped", source.skipped):
+            say(line)
     with ExitStack() as stack:
         leads, device = stack.enter_context(_processes(options.device))
         document["threads"] = told_by_the_first(_threads(folder, resume, threads), place()[1])
@@ -119,9 +128,7 @@ def run(
         if leads:  # the others would meet what this one has begun to write
             stack.enter_context(_alone(folder))
             _check_folder(folder, document, resume=resume)
-        preset = style.PRESETS[options.preset]
         camera = _camera(options, preset).to(device)
-        source = _source(options, preset)
         changes = {name: getattr(options, name) for name in ("steps", "batch", "size", "tolerance")}
         settings = preset.for_scenes(
             len(source), seed=options.seed, **{name: value for name, value in changes.items() if value is not None}
@@ -197,9 +204,11 @@ def _camera(options: Options, preset: style.Preset) -> Camera:
 
 def _source(options: Options, preset: style.Preset) -> style.Source:
     size = options.size or preset.settings.size
-    if options.patches is None:
-        return style.BuiltinScenes(size)
-    return style.PatchScenes(options.patches, size=size)
+    if options.patches is not None and options.photos is not None:
+        raise ValueError("patches and photos both say what to train on. Leave one of them out.")
+    if options.patches is not None:
+        return style.PatchScenes(options.patches, size=size)
+    return style.BuiltinScenes(size) if options.photos is None else style.PhotoScenes(options.photos, size)
 
 
 def style_features(name: str, weights: str | None = None) -> Any:
@@ -259,12 +268,21 @@ def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> No
             )
     if there["style"] != document["style"]:
         raise ValueError(f"{document['options']['style']} is not the picture that {folder} was begun with.")
+    if there.get("photos") != document.get("photos"):
+        raise ValueError(
+            f"the photographs in {document['options']['photos']} are not those that {folder} was begun with. Put them "
+            "back, or choose another --out."
+        )
 
 
-class _Config(TypedDict):
+class _Always(TypedDict):
     options: dict[str, Any]
     style: str
     threads: int
+
+
+class _Config(_Always, total=False):
+    photos: str
 
 
 def _config(path: Path) -> _Config:
@@ -324,7 +342,7 @@ def _write_report(path: Path, options: Options, settings: Any, trained: style.Tr
         ("style", options.style),
         ("preset", options.preset),
         ("steps", f"{settings.steps} of {settings.batch} scenes of {settings.size} x {settings.size} pixels"),
-        ("scenes", options.patches or "built-in photographs"),
+        ("scenes", options.patches or options.photos or "built-in photographs"),
         ("features", options.features),
         ("time", f"{plots.duration(seconds)}, {plots.duration(seconds / max(1, trained.steps_timed))} a step"),
         *((f"loss: {name}", f"{value:.4f}") for name, value in last.items()),

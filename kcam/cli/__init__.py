@@ -402,7 +402,13 @@ def train(
         "styled.safetensors"
     ),
     preset: Annotated[str, typer.Option("--preset", help="quick, standard or thesis")] = "quick",
-    patches: Annotated[str, typer.Option("--patches", help="a patch store; without one, the built-in scenes")] = "",
+    photos: Annotated[
+        str,
+        typer.Option("--photos", help="a folder of your own photographs to train on; else kcam's few built-in ones"),
+    ] = "",
+    patches: Annotated[
+        str, typer.Option("--patches", help="a patch store of spectral cubes to train on, in place of photographs")
+    ] = "",
     camera: Annotated[str, typer.Option("--camera", help="a saved camera to start from")] = "",
     stage: Annotated[bool, typer.Option("--stage/--no-stage", help="with a style stage, or the camera alone")] = True,
     features: FeaturesOption = "steerable",
@@ -431,6 +437,7 @@ def train(
             out=str(out),
             preset=preset,
             patches=patches or None,
+            photos=photos or None,
             camera=camera or None,
             features=features,
             vgg_weights=vgg_weights or None,

@@ -15,9 +15,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from kcam.inputs import named
+
 ALL_DONE, SOME_FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
-MOST_NAMED = 10
-"""Files that are named in plain text, each with its reason; --json and --report name all."""
 OFTEN, SELDOM, SHARE = 1.0, 10.0, 0.05
 """A line of progress: none before so many seconds are over, and one after so many, or after this share of the work."""
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -182,10 +182,8 @@ def end(
     for line in [text] if as_json else lines:
         typer.echo(line)
     for word, reasons in (("skipped", skipped or {}), ("failed", failed)):
-        for name, reason in sorted(reasons.items())[:MOST_NAMED]:
-            typer.echo(f"{word}: {name}: {reason}", err=True)
-        if len(reasons) > MOST_NAMED:
-            typer.echo(f"{word}: and {len(reasons) - MOST_NAMED} more, which --json names", err=True)
+        for line in named(word, reasons, rest="--json"):
+            typer.echo(line, err=True)
     if report is not None:
         report.parent.mkdir(parents=True, exist_ok=True)
         report.write_text(text + "\n")

@@ -6,7 +6,7 @@ from kcam.style.painting import paint
 from kcam.style.pictures import STYLES, painting
 from kcam.style.presets import PRESETS, Preset, style_camera
 from kcam.style.run import StyleWarning, TrainingError
-from kcam.style.scenes import BuiltinScenes, PatchScenes, Source
+from kcam.style.scenes import BuiltinScenes, PatchScenes, PhotoScenes, Source
 from kcam.style.settings import Settings
 from kcam.style.training import Progress, Trained, fit
 from kcam.style.vgg import VGG16Features
@@ -16,6 +16,7 @@ __all__ = [
     "STYLES",
     "BuiltinScenes",
     "PatchScenes",
+    "PhotoScenes",
     "Preset",
     "Progress",
     "Settings",
