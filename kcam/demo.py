@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from time import perf_counter
 
 import torch
 from torch import Tensor
@@ -83,17 +82,12 @@ def run(
                 scene = scene.with_depth(DISTANCE)
             rows.append([scene.to_srgb()[0]])
             for name, camera in cameras.items():
-                times, raw, picture = shoot(camera, scene, seed=seed)
+                generator = torch.Generator().manual_seed(seed)
+                taken = list(plots.steps(camera, scene, generator=generator))
+                picture = taken[-1].signal
                 rows[-1].append(picture[0])
                 figure = plots.pipeline_figure(
-                    scene=rows[-1][0],
-                    raw=raw[0] - camera.resolve().black_level,
-                    picture=picture[0],
-                    tile=plots.mosaic_tile(camera),
-                    times=times,
-                    title=scene_title,
-                    subtitle=f"{CAMERAS[name][0]};  {_where(scene)}",
-                    zoom=zoom,
+                    camera, scene, taken, title=f"{scene_title}, through the {name}", zoom=zoom
                 )
                 paths += [out / f"{scene_name}-{name}.png", out / "pictures" / f"{scene_name}-{name}.png"]
                 plots.save_figure(figure, paths[-2])
@@ -111,24 +105,9 @@ def run(
     return paths
 
 
-def _where(scene: Scene) -> str:
-    depth = torch.as_tensor(scene.depth)
-    near, far = plots.metres(float(depth.min())), plots.metres(float(depth.max()))
-    _, height, width = scene.shape
-    return f"{near if near == far else f'{near} to {far}'} away;  {width} \u00d7 {height} pixels"
-
-
 def shoot(camera: Camera, scene: Scene, *, seed: int = 0) -> tuple[list[tuple[str, float]], Tensor, Tensor]:
     """Take a picture; returns (stage, seconds) for each stage, the raw signal (empty if none), and the picture."""
-    generator = torch.Generator().manual_seed(seed)
-    demosaics = {cls.__name__ for cls in DEMOSAICING}
-    times: list[tuple[str, float]] = []
-    raw = picture = torch.empty(0)
-    start = perf_counter()
-    for name, signal in camera.steps(scene, generator=generator):
-        times.append((name, perf_counter() - start))
-        if name in demosaics:
-            raw = picture
-        picture = signal
-        start = perf_counter()
-    return times, raw, picture
+    taken = list(plots.steps(camera, scene, generator=torch.Generator().manual_seed(seed)))
+    at = next((n for n, step in enumerate(taken) if isinstance(step.stages[0], DEMOSAICING)), 0)
+    raw = taken[at - 1].signal if at else torch.empty(0)
+    return [(step.name, step.seconds) for step in taken], raw, taken[-1].signal

@@ -467,26 +467,6 @@ def test_no_two_curves_are_alike(count: int) -> None:
     assert apart.min() > 0.05
 
 
-def test_raw_is_shown_bright_and_black_is_black(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gray wall at 0.3 of the well beside black, in RGGB: its mean over a tile was a dark quarter of red and blue."""
-    shown: list[np.ndarray] = []
-    draw = plots.Sheet.picture
-
-    def picture_of(sheet: plots.Sheet, image: np.ndarray, *where: float, **style: bool) -> Any:
-        shown.append(image)
-        return draw(sheet, image, *where, **style)
-
-    monkeypatch.setattr(plots.Sheet, "picture", picture_of)
-    raw = 0.3 * (torch.arange(80) >= 40).float().expand(1, 60, 80)
-    picture = torch.zeros(3, 60, 80)
-    tile = plots.mosaic_tile(Camera.phone())
-    times = [("ADC", 0.1)]
-    plots.pipeline_figure(scene=picture, raw=raw, picture=picture, tile=tile, times=times, title="t", subtitle="s")
-    panel = next(image for image in shown if image.max() > 0.9)
-    assert panel[:, 60].max() > 0.95
-    assert panel[:, 20].max() == 0
-
-
 def test_durations() -> None:
     times = {0.0012: "1.2 ms", 0.0123: "12 ms", 0.9999: "1 s", 12.34: "12.3 s", 119: "119 s", 123.4: "2.06 min"}
     times |= {8000: "2.22 h", 500_000: "5.79 days"}

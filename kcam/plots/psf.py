@@ -151,10 +151,10 @@ def psf_figure(
 def optics_text(imaging: optics.Imaging) -> str:
     """The lens and its pixels in a line."""
     lens, pixels = imaging.lens, f"pixels of {float(imaging.pixel_pitch) / um:.3g} \u00b5m"
-    if not isinstance(lens, optics.Lens):
+    if not isinstance(lens, (optics.Lens, optics.CompoundLens)):
         return f"{type(lens).__name__};  {pixels}"
     return (
-        f"Focal length {lens.focal_length() * 1e3:.3g} mm, f/{lens.f_number:.2g}, "
+        f"Focal length {float(lens.focal_length()) * 1e3:.3g} mm, f/{float(lens.f_number):.2g}, "
         f"in focus at {metres(lens.focus_distance)};  {pixels}"
     )
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
 
 from kcam import files
 from kcam.plots.pictures import check_writable
@@ -58,6 +60,23 @@ class Sheet:
         axes.set(xticks=[], yticks=[])
         axes.spines[:].set_visible(False)
         return axes
+
+
+def shortened(text: str, width: float, *, size: float = LABEL, weight: str = "normal") -> str:
+    """A text in one line that is at most so wide [inches]: cut off at its end, which an ellipsis shows."""
+    font = FontProperties(size=size, weight=weight)
+
+    def wide(part: str) -> float:
+        part = part.strip().replace("$", "S")  # no formula
+        return 1.06 * TextPath((0, 0), part, prop=font).get_extents().x1 / 72 if part else 0.0  # hinting widens it
+
+    text = " ".join(text.split())[: int(width * 72)]  # a point and more for each letter
+    if wide(text) <= width:
+        return text
+    kept = min(len(text) - 1, int(len(text) * width / wide(text)) + 3)
+    while kept > 0 and wide(f"{text[:kept]}\u2026") > width:
+        kept -= 1
+    return f"{text[:kept].rstrip(' ,;')}\u2026"
 
 
 def duration(seconds: float) -> str:
