@@ -20,6 +20,7 @@ from kcam.threads import no_more_than_free
 from kcam.units import mm, nm, um
 
 if TYPE_CHECKING:
+    from kcam.linear import LinearCamera
     from kcam.planner import Plan
 
 DEMOSAICING = (isp.Demosaic, isp.LearnedDemosaic)
@@ -174,6 +175,34 @@ class Camera(nn.Module):
             "this camera has no isp.Demosaic or LearnedDemosaic, so nothing marks where its raw signal ends. "
             "Use a slice: camera[:4](scene)."
         )
+
+    def linear(self, scene: Scene) -> LinearCamera:
+        """The linear part of the camera, from a scene's light to its raw signal, as an operator with its transpose.
+
+        raw = A x + offset + noise,   A = gain mosaic filter imaging
+
+        A holds all that is linear in the light: PSFs, their variation over the field, distortion, occlusion (which a
+        depth map decides, not the light), filter, mosaic, exposure, gain. Noise, saturation and rounding are left out,
+        black level and dark current are its `offset`. It ends where `raw` does; without a demosaic before the white
+        balance, else with the last stage.
+
+        Args:      scene: what the operator is for. Its depth, spectra, light, luminance and size are kept; by its
+                   picture is decided, once, what an Imaging decides by the look of a scene: whether it is computed in
+                   float64, how finely depth is cut, at how many places of the field PSFs are computed. Automatic
+                   exposure goes by the scene's white, not by its picture.
+        Returns:   A: ``A(x)`` or ``A.forward(x)``, ``A.adjoint(y)``, ``A.norm()``; x (B,K,H,W) are coefficient planes
+                   as in `Scene`, of any sign: for a picture three of linear sRGB, for a cube its bands; ``A.light`` are
+                   the scene's own, for which ``A(x) + A.offset`` is ``noiseless().raw(scene)`` without limits and
+                   steps. y (B,C,H,W), 1.0 = full scale.
+        Raises:    TypeError for what is no Scene; ValueError for a stage before the raw that is not linear, and for an
+                   Imaging of a plan that lowers the rank of each scene.
+        Valid where no pixel saturates; of a plain nn.Module before the raw as far as three signals can tell.
+        Source:    for what to do with it, Chambolle and Pock, J. Math. Imaging Vis. 40 (2011): total variation by A and
+                   its transpose. The latter is the vector-Jacobian product, exact since A is linear.
+        """
+        from kcam.linear import LinearCamera
+
+        return LinearCamera(self, scene)
 
     def noiseless(self) -> Camera:
         """The same camera with every random stage at its mean; it shares the parameters."""

@@ -27,7 +27,7 @@ LAYERS = [
     {"kcam.sensor"},
     {"kcam.isp"},
     {"kcam.camera"},
-    {"kcam.planner"},
+    {"kcam.planner", "kcam.linear"},
     {"kcam.augmentation", "kcam.data"},
     {"kcam.style"},
     {"kcam.tradeoff"},
@@ -40,9 +40,9 @@ LAYERS = [
 LAYER = {module: index for index, row in enumerate(LAYERS) for module in row}
 DATA = [{"cube"}, {"bands"}, {"readers", "patches"}, {"convert", "inspection", "dataset", "export"}]
 """The same inside kcam.data: readers do not know of the store, nor the store of readers."""
-METHODS = {("kcam.camera", "kcam.planner"), ("kcam.optics", "kcam.plots")}
-"""camera.plan(...) is a method for the user's sake, but a planner is made of cameras: imported when it is called; so is
-the figure of lens.draw().
+METHODS = {("kcam.camera", "kcam.planner"), ("kcam.camera", "kcam.linear"), ("kcam.optics", "kcam.plots")}
+"""camera.plan(...) is a method for the user's sake, but a planner is made of cameras: imported when it is called; so
+are the operator of camera.linear(...) and the figure of lens.draw().
 """
 FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath", "zarr"}
 """Not among the core dependencies: the library needs none of them at import, nor at run time."""
@@ -97,7 +97,7 @@ def test_imports_point_upstream(path: Path) -> None:
 # The house of optics: a room imports from rooms below it and from its own, and no module from one that needs it, even
 # if only for the type checker.
 FLOORS = ["autograd", "numerics", "source", "regions", "banks", "pupil", "elements", "propagation", "compound"]
-FLOORS += ["accuracy", "lens", "measured", "rendering", "field", "imaging", "__init__"]
+FLOORS += ["accuracy", "lens", "measured", "rendering", "field", "imaging", "linear", "__init__"]
 
 
 def test_optics_is_a_house_with_floors() -> None:
