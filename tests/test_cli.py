@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import io
+import itertools
 import math
 import re
 import subprocess
@@ -17,9 +19,12 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
+from rich.console import Console
+from typer.testing import CliRunner
 
 import kcam
 from kcam import Camera, cli, demo, files, optics, plots
+from kcam.cli import console
 from kcam.scene import read_picture
 from kcam.units import mm, nm
 
@@ -490,3 +495,132 @@ def test_demo_into_a_file(inside: str, photo: Path) -> None:
 def test_demo_command(tmp_path: Path) -> None:
     output = run("demo", "--out", tmp_path / "demo")
     assert "overview.png" in output
+
+
+# ---- progress ------------------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Wall time that passes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def told(
+    seconds: list[float], total: int | None, *, what: str = "step", first: int | None = None
+) -> list[tuple[float, str]]:
+    """When each line was printed, and the line, where steps take so long."""
+    clock, lines = Clock(), []
+    advance = console.Lines(what, total, clock=clock, write=lambda line: lines.append((clock.now - 1000, line)))
+    for index, taken in enumerate(seconds):
+        clock.now += taken
+        advance("loss 0.123", done=None if first is None else first + index)
+    return lines
+
+
+def test_a_line_of_progress_says_what_is_left() -> None:
+    lines = told([0.3] * 600, 600)
+    assert lines[0][1] == "step 30 of 600, loss 0.123, 9 s, 3 min left"
+    assert lines[3][1] == "step 120 of 600, loss 0.123, 36 s, 2 min left"
+    assert [line.split(",")[0] for _, line in lines] == [f"step {step} of 600" for step in range(30, 601, 30)]
+    assert told([0.3] * 3000, None)[0] == (pytest.approx(10.2), "step 34, loss 0.123, 10 s")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_lines_come_neither_too_often_nor_too_seldom(seed: int) -> None:
+    """One a second at most; after 10 s, or 5 % of the steps, at the next step."""
+    random = np.random.default_rng(seed)
+    steps = int(random.integers(3, 800))
+    seconds = list(random.lognormal(math.log(random.choice([0.001, 0.05, 1, 12])), 1, steps))
+    when = np.cumsum(seconds)
+    moments = np.array([0, *(moment for moment, _ in told(seconds, steps)), when[-1]])
+    assert (np.diff(moments[:-1]) >= 1 - 1e-9).all()
+    for before, after in itertools.pairwise(moments):
+        silent = np.flatnonzero((when > before + 1e-9) & (when < after - 1e-9))  # steps without a line between two
+        assert not len(silent) or when[silent[-1]] - before < 10
+        assert not len(silent) or when[silent[-1]] - before < 1 or len(silent) < 0.05 * steps
+    assert when[-1] >= 1 or len(moments) == 2
+
+
+@pytest.mark.parametrize("first", [30.0, 600.0])
+def test_a_slow_first_step_does_not_count(first: float) -> None:
+    left = [
+        console.time_left([(0, 0), (first, 1), *((first + 0.5 * k, 1 + k) for k in range(1, n))], 101)
+        for n in (2, 3, 9)
+    ]
+    assert left == pytest.approx([49.5, 49.0, 46.0])
+    lines = told([first] + [0.5] * 100, 101)
+    assert lines[0][1] == f"step 1 of 101, loss 0.123, {console.rounded(first)}"  # of one step nothing is known yet
+    assert lines[1][1].endswith("47 s left")
+
+
+def test_steps_that_were_found_done_do_not_count() -> None:
+    """A store that is gone on with: a hundred scenes at once, then some that take their time."""
+    marks = [(0.0, 0), *((0.001 * k, k) for k in range(1, 101)), *((0.1 + 2.0 * k, 100 + k) for k in range(1, 11))]
+    assert console.time_left(marks, 120) == pytest.approx(20, rel=0.01)
+    lines = told([2.0] * 20, 1000, first=901)  # a run that goes on from a checkpoint
+    assert lines[0] == (10, "step 905 of 1000, loss 0.123, 10 s, 3 min left")
+
+
+def test_nothing_is_left_or_known() -> None:
+    assert console.time_left([(0, 0), (1, 1), (2, 2)], 2) == 0
+    assert console.time_left([(0, 0), (1, 1), (2, 2)], None) is None
+    assert console.time_left([(0, 0), (1, 5), (2, 5)], 9) is None  # stands still
+    assert console.time_left([(0, 5), (1, 6), (2, 3)], 9) is None  # went back
+    assert [console.rounded(s) for s in (0.2, 34.4, 99, 120, 5000, 7000)] == [
+        "0 s",
+        "34 s",
+        "99 s",
+        "2 min",
+        "83 min",
+        "1.9 h",
+    ]
+
+
+def test_where_there_is_no_terminal_lines_go_to_the_standard_error(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(console, "OFTEN", 0.0)
+    result = CliRunner().invoke(cli.app, f"paint --steps 20 --size 64 --out {tmp_path / 'a.png'}".split())
+    assert result.stdout == f"{tmp_path / 'a.png'}\n"
+    lines = result.stderr.splitlines()
+    assert len(lines) == 20
+    assert re.fullmatch(r"step 20 of 20, loss \d\.\d+ \((\w+ \d\.\d+(, )?)+\), \d+ s", lines[-1])
+    assert "\x1b" not in result.output
+    result = CliRunner().invoke(
+        cli.app, f"train woodcut --steps 3 --size 64 --no-stage --out {tmp_path / 'a.safetensors'}".split()
+    )
+    assert result.exit_code == 0, result.output
+    lines = [line for line in result.stderr.splitlines() if line.startswith("step")]
+    assert [line.split(",")[0] for line in lines] == ["step 1 of 3", "step 2 of 3", "step 3 of 3"]
+
+
+def test_on_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    for terminal in ("xterm", "dumb"):
+        shown = io.StringIO()
+        monkeypatch.setenv("TERM", terminal)
+        terminal_err = Console(file=shown, force_terminal=True, width=100)
+        monkeypatch.setattr(console, "err", terminal_err)
+        with console.progress("convert", 2) as advance:
+            advance("[/b] is no markup")
+            advance("last", 2)
+        assert ("convert 2 of 2: last" in shown.getvalue()) == (terminal == "xterm")
+        assert ("\x1b" in shown.getvalue()) == (terminal == "xterm")
+
+
+def test_the_help_of_data_and_a_wrong_command() -> None:
+    text = unboxed(run("data", "--help"))
+    assert re.search(r"convert .*cube files\. inspect .* extract .* verify .* export ", text)
+    assert "..." not in text.split("Commands")[1]
+    for name in ("convert", "inspect", "extract", "verify", "export"):
+        assert "--json" in run("data", name, "--help")
+    assert "No such command" in run("data", "mend", status=2)
+
+
+def test_the_command_loads_no_more_than_it_must() -> None:
+    late = ("kcam.data", "kcam.style", "matplotlib", "tifffile")
+    code = f"import sys, kcam.cli; print([name for name in {late} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from kcam import files, isp, plots, train
 from kcam.camera import Camera
 from kcam.cli import app
 from kcam.scene import Scene
-from kcam.style import TrainingError, painting, style_camera
+from kcam.style import PhotoScenes, TrainingError, painting, scenes, style_camera
 
 CHOSEN = {"stage": False, "steps": 3, "size": 64, "batch": 1}
 
@@ -244,3 +245,157 @@ def test_train_shoot_and_paint_as_commands(tmp_path: Path, trained: Path, monkey
     result = invoke("paint --style nothing --out texture.png")
     assert result.exit_code == 2
     assert 'unknown style "nothing"' in " ".join(result.output.split())
+
+
+# ---- a user's own photographs --------------------------------------------------------------------------------------
+
+
+def photographs(folder: Path, *, count: int = 3, size: tuple[int, int] = (90, 120)) -> Path:
+    """Pictures of every kind, in folders, with what is none between them."""
+    (folder / "inside" / "more").mkdir(parents=True)
+    (folder / ".hidden").mkdir()
+    for index in range(count):
+        pixels = torch.rand(3, *size, generator=torch.Generator().manual_seed(index))
+        place = folder / ("", "inside", "inside/more")[index % 3]
+        plots.write_picture(pixels, place / f"photo{index}.{('png', 'jpg', 'tif', 'webp')[index % 4]}")
+    plots.write_picture(torch.rand(3, 40, 400), folder / "narrow.png")
+    plots.write_picture(torch.rand(3, *size), folder / ".hidden.png")
+    plots.write_picture(torch.rand(3, *size), folder / ".hidden" / "a.png")
+    (folder / "text.jpg").write_text("no picture")
+    (folder / "notes.txt").write_text("nor this")
+    return folder
+
+
+SKIPPED = [
+    "skipped: narrow.png: it has 400 x 40 pixels, and crops of 64 x 64 are trained on.",
+    "skipped: text.jpg: it cannot be read as a picture.",
+]
+
+
+def test_it_trains_on_photographs_and_goes_on_with_the_same(tmp_path: Path, monkeypatch) -> None:
+    without_pictures(monkeypatch)
+    photos = photographs(tmp_path / "photos")
+    whole, stopped = tmp_path / "whole.safetensors", tmp_path / "stopped.safetensors"
+    result, lines = run(whole, photos=str(photos))
+    assert result.finished
+    assert lines == SKIPPED
+    document = json.loads((tmp_path / "whole" / "config.json").read_text())
+    assert document["options"]["photos"] == str(photos)
+
+    def stop_once(progress, steps: int) -> None:
+        if progress.step == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    run(stopped, photos=str(photos), advance=stop_once)
+    with pytest.raises(ValueError, match=r"was begun with photos = '.*photos', not None. Use the same options"):
+        run(stopped, resume=True)
+    (photos / "narrow.png").unlink()  # was not trained on
+    picture = (photos / "photo0.png").read_bytes()
+    plots.write_picture(torch.full((3, 90, 120), 0.5), photos / "photo0.png")
+    changed = (
+        r"the photographs in .*photos are not those that .*stopped was begun with. Put them back, or choose another"
+    )
+    with pytest.raises(ValueError, match=changed):
+        run(stopped, photos=str(photos), resume=True)
+    (photos / "photo0.png").write_bytes(picture)
+    plots.write_picture(torch.rand(3, 90, 120), photos / "new.png")
+    with pytest.raises(ValueError, match=changed):
+        run(stopped, photos=str(photos), resume=True)
+    (photos / "new.png").unlink()
+    assert run(stopped, photos=str(photos), resume=True, threads=None)[0].finished
+    assert stopped.read_bytes() == whole.read_bytes()
+
+
+def test_the_command_names_the_photographs_that_are_too_small(tmp_path: Path) -> None:
+    photos = photographs(tmp_path / "photos")
+    common = f"--steps 1 --size 64 --batch 1 --no-stage --threads 1 --out {tmp_path / 'a.safetensors'}"
+    result = invoke(f"train {CHOSEN['style']} --photos {photos} {common}")
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines()[:2] == SKIPPED
+    assert str(photos) in (tmp_path / "a" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda folder: None, r"there is no folder .*photos. Expected one of photographs"),
+        (lambda folder: folder.write_text(""), r"photos is a file. Expected a folder of photographs"),
+        (lambda folder: folder.mkdir(), r"there is no picture in the folder .*photos: expected .png, .jpg, .*.bmp\.$"),
+        (
+            lambda folder: (folder.mkdir(), (folder / "a.heic").write_text(""), (folder / ".b.png").write_text("")),
+            r"expected .png, .jpg, .*, and there are 1 other files\.$",
+        ),
+        (
+            lambda folder: photographs(folder, count=0),
+            r"none of the 2 pictures in .* can be trained on. narrow.png: it has 400 x 40 pixels.* or a smaller --size",
+        ),
+    ],
+)
+def test_photographs_that_are_none(make, match: str, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    make(folder)
+    with pytest.raises((ValueError, OSError), match=match):
+        run(tmp_path / "a.safetensors", photos=str(folder))
+
+
+def test_patches_and_photographs_are_two_answers(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="patches and photos both say what to train on. Leave one of them out"):
+        run(tmp_path / "a.safetensors", photos="a", patches="b")
+
+
+def test_crops_of_photographs_are_drawn_by_seed_and_step_alone(tmp_path: Path, monkeypatch) -> None:
+    folder = photographs(tmp_path / "photos", count=7)
+    plots.write_picture(torch.rand(1, 100, 100), folder / "gray.png")
+    source = PhotoScenes(folder, 64)
+    assert len(source.photos) == 8
+    assert len(source) == 8
+    whole, origins = source.draw(range(6), seed=3, step=9)
+    assert whole.shape == (6, 64, 64)
+    assert 0 <= whole.coefficients.min() <= whole.coefficients.max() <= 1
+    assert all(re.fullmatch(r"\w+\.\w+ at 1\d\d? pixels, row \d+, column \d+", origin) for origin in origins)
+    monkeypatch.setattr(scenes, "KEPT", 0)  # whatever is kept, and in whatever company
+    for rows in ([5], [0, 3], [2, 1]):
+        part, where = PhotoScenes(folder, 64).draw(rows, seed=3, step=9)
+        assert torch.equal(part.coefficients, whole.coefficients[rows])
+        assert where == [origins[row] for row in rows]
+    assert source.draw([0], seed=4, step=9)[1] != origins[:1]
+
+
+def test_a_crop_is_the_photograph(tmp_path: Path) -> None:
+    """Of one colour it keeps that colour, as one of the ways in which crops are varied leaves it as it is."""
+    plots.write_picture(torch.tensor([0.8, 0.4, 0.2]).view(3, 1, 1).expand(3, 200, 300), tmp_path / "a.png")
+    drawn, _ = PhotoScenes(tmp_path, 64).draw(range(24), seed=0, step=0)
+    colours = drawn.to_srgb().mean((2, 3))
+    assert (colours - torch.tensor([0.8, 0.4, 0.2])).abs().amax(1).min() < 0.005  # 8 bits
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_photographs_are_shrunk_as_far_as_a_crop_fits(seed: int) -> None:
+    random = torch.Generator().manual_seed(seed)
+    size, short, long = (int(torch.randint(low, 3000, (), generator=random)) for low in (16, 16, 16))
+    short, long = sorted((max(short, size), max(long, size)))
+    sides = scenes._sides(long, short, size)
+    assert sides
+    for side in sides:
+        assert side <= long
+        assert round(side * short / long) >= size
+    assert max(sides) <= max(1024, size * long / short + 1)
+    assert scenes._sides(4000, 3000, 128) == [1024, 512, 358, 205]
+    assert scenes._sides(300, 200, 64) == [300, 205]
+
+
+def test_a_photograph_that_is_cut_short_is_passed_over(tmp_path: Path) -> None:
+    """It is found when it is drawn: its header is whole."""
+    plots.write_picture(torch.rand(3, 90, 120), tmp_path / "a.jpg")
+    plots.write_picture(torch.rand(3, 90, 120), tmp_path / "b.jpg")
+    (tmp_path / "a.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:2000])
+    source = PhotoScenes(tmp_path, 64)
+    assert not source.skipped
+    with pytest.warns(
+        UserWarning, match=r"cannot read .*a.jpg as a picture.* The next photograph is taken in its place"
+    ):
+        _, origins = source.draw(range(8), seed=0, step=0)
+    assert {origin.split()[0] for origin in origins} == {"b.jpg"}
+    (tmp_path / "b.jpg").write_bytes((tmp_path / "b.jpg").read_bytes()[:2000])
+    with pytest.warns(UserWarning, match="cannot read"), pytest.raises(ValueError, match="none of the 2 photographs"):
+        PhotoScenes(tmp_path, 64).draw([0], seed=0, step=0)

@@ -83,7 +83,7 @@ class Lines:
     def __call__(self, note: str = "", total: int | None = None, done: int | None = None) -> None:
         """As in `Advance`."""
         now = self._clock()
-        if done is not None and len(self._marks) == 1:
+        if done is not None and not self._done:
             self._marks.clear()  # a run that goes on: what was done before took none of this time
             self._told = done - 1
         self._done = self._done + 1 if done is None else done
@@ -93,7 +93,7 @@ class Lines:
         if waited >= SELDOM or (waited >= OFTEN and self.total is not None and moved >= SHARE * self.total):
             left = time_left(self._marks, self.total)
             parts = (_count(self.what, self._done, self.total), note, rounded(now - self._began))
-            self._write(", ".join(part for part in parts if part) + (f", {rounded(left)} left" if left else ""))
+            self._write(", ".join(part for part in parts if part) + (f", {rounded(left)} left" if left and left >= 0.5 else ""))
             self._last, self._told = now, self._done
 
 

@@ -143,7 +143,7 @@ def cube_array(
                front, of length 1, does not count.
     """
     listed = [f"{name} ({_sizes(shape)})" for name, (shape, _) in sorted(arrays.items())]
-    more = f" and {len(listed) - _MOST_LISTED} more"
+    more = f"and {len(listed) - _MOST_LISTED} more"
     listed = listed if len(listed) <= _MOST_LISTED else [*listed[:_MOST_LISTED], more]
     fitting = [name for name, (shape, real) in arrays.items() if real and len(without_first(shape)) == 3]
     key = options.key
