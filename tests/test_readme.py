@@ -36,6 +36,7 @@ EXAMPLES = {
     "augmentation_gallery": ["--side", "40", "--out", "augmentations.png"],
     "train_segmentation": ["--quick", "--out", "training.json"],
     "plan_scenes": ["--size", "40", "--out", "plans"],
+    "reconstruct": ["--size", "40", "--steps", "10", "--out", "reconstructed.png"],
 }
 SLOW = ("plan_scenes", "train_lens", "lens_gallery", "augmentation_gallery")
 

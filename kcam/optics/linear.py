@@ -68,7 +68,7 @@ class LinearImaging(Imaging):
 
         with _optics():
             how = self._decisions.get((self, scene, vergences, weights, like.dtype, like.device), decide)
-        return _Decided(*(getattr(field, own.name) for own in fields(field)), how)
+        return _Decided(**{own.name: getattr(field, own.name) for own in fields(field)}, decided=how)
 
 
 @dataclass(frozen=True)
