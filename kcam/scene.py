@@ -180,6 +180,64 @@ class Scene:
         return cls.from_rgb(image, depth=depth, wavelengths=wavelengths, illuminant=illuminant, luminance=luminance)
 
     @classmethod
+    def from_folder(
+        cls,
+        folder: str | os.PathLike[str],
+        depth_folder: str | os.PathLike[str] | None = None,
+        *,
+        depth: float | None = None,
+        depth_scale: float = 1e-3,
+        size: int | tuple[int, int] | None = None,
+        wavelengths: Tensor | None = None,
+        illuminant: str | Tensor = "D65",
+        luminance: float = 1000.0,
+    ) -> Scene:
+        """The photographs of a folder, with their depth maps, as one batch (B,H,W) in natural order of their names.
+
+        Which files these are, and what is done about depth that was not measured, says `kcam.data.PhotoDataset`; all
+        stand in memory at once, 12 bytes a pixel. ``PhotoDataset(...).scene(i)`` reads one at a time: it knows their
+        names, and they may be of several sizes.
+
+        Args:      depth_folder: of maps of the same names; None if there are none.
+                   depth: of photographs without a map [m]. None: 2 m where there is no `depth_folder`; where there is
+                   one, all must have maps.
+                   depth_scale: metres per count of maps in whole numbers: 1e-3 for millimetres, 1/5000 for TUM's.
+                   size: of the longer side [pixels], or (height, width), to which they are cropped: see `resized`.
+                   Others: as for `Scene`.
+        Raises:    as `PhotoDataset`; ValueError for photographs of several sizes.
+        """
+        from kcam.data import PhotoDataset
+
+        alike = 2.0 if depth is None else depth
+        photos = PhotoDataset(
+            folder,
+            depth_folder,
+            depth=alike if depth_folder is None else depth,
+            depth_scale=depth_scale,
+            size=size,
+        )
+        images: list[Tensor] = []
+        maps: list[Tensor] = []
+        for index, name in enumerate(photos.names):
+            image, own, _, _ = photos[index]
+            if images and image.shape != images[0].shape:
+                (_, height, width), (_, rows, columns) = images[0].shape, image.shape
+                raise ValueError(
+                    f"a batch has one size: {photos.names[0]} has {height} x {width} pixels, {name} {rows} x "
+                    f"{columns}. Crop them to one, size=({min(height, rows)}, {min(width, columns)}), or take them one "
+                    "by one: kcam.data.PhotoDataset(...).scene(i)."
+                )
+            images.append(image)
+            maps.append(own)
+        return cls.from_rgb(
+            torch.stack(images),
+            depth=alike if depth_folder is None else torch.stack(maps),
+            wavelengths=wavelengths,
+            illuminant=illuminant,
+            luminance=luminance,
+        )
+
+    @classmethod
     def builtin(
         cls,
         name: str,
@@ -212,7 +270,7 @@ class Scene:
             scene = cls.from_rgb(image, depth=depth, wavelengths=grid, illuminant=light, luminance=luminance)
             return scene if size is None else scene.resized(size)
         draw, shape = CHARTS[name]
-        planes, reflectance = draw(*_target_shape(size, shape), grid)
+        planes, reflectance = draw(*target_shape(size, shape), grid)
         return cls(planes, reflectance * light, grid, illuminant=light, luminance=luminance)
 
     @property
@@ -271,7 +329,7 @@ class Scene:
 
         Raises:    ValueError for a size below 1.
         """
-        return _resized(self, _target_shape(size, self.shape[1:]))
+        return _resized(self, target_shape(size, self.shape[1:]))
 
     def low_rank(self, rank: int) -> Scene:
         """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.
@@ -427,7 +485,8 @@ def _is_map(depth: float | Tensor) -> TypeGuard[Tensor]:
     return isinstance(depth, Tensor) and depth.ndim == 4
 
 
-def _target_shape(size: int | tuple[int, int] | None, shape: tuple[int, int]) -> tuple[int, int]:
+def target_shape(size: int | tuple[int, int] | None, shape: tuple[int, int]) -> tuple[int, int]:
+    """(height, width) of what is resized: `size` of the longer side [pixels], or both; ValueError for less than 1."""
     if size is None:
         return shape
     height, width = shape
@@ -440,18 +499,26 @@ def _target_shape(size: int | tuple[int, int] | None, shape: tuple[int, int]) ->
 
 
 def _resized(scene: Scene, shape: tuple[int, int]) -> Scene:
-    """Cropped in the middle to the proportions of `shape`, then resized: colours filtered, distances picked."""
-    _, height, width = scene.shape
-    if (height, width) == shape:
+    """`fitted`: colours filtered, distances picked."""
+    if scene.shape[1:] == shape:
         return scene
+    depth = fitted(scene.depth, shape, pick=True) if _is_map(scene.depth) else scene.depth
+    return replace(scene, coefficients=fitted(scene.coefficients, shape), depth=depth)
+
+
+def fitted(planes: Tensor, shape: tuple[int, int], *, pick: bool = False) -> Tensor:
+    """Planes (B,C,H,W) cropped in their middle to the proportions of `shape`, then resized to it.
+
+    Args:      pick: the nearest pixels, for what has no mean, such as distances; else they are filtered.
+    """
+    height, width = planes.shape[-2:]
     scale = max(shape[0] / height, shape[1] / width)
-    window = (max(1, min(height, round(shape[0] / scale))), max(1, min(width, round(shape[1] / scale))))
-    scene = scene.crop(top=(height - window[0]) // 2, left=(width - window[1]) // 2, height=window[0], width=window[1])
-    planes = F.interpolate(scene.coefficients, shape, mode="bilinear", antialias=True)
-    depth = scene.depth
-    if _is_map(depth):
-        depth = F.interpolate(depth, shape, mode="nearest-exact")
-    return replace(scene, coefficients=planes, depth=depth)
+    rows, columns = (max(1, min(n, round(to / scale))) for n, to in ((height, shape[0]), (width, shape[1])))
+    top, left = (height - rows) // 2, (width - columns) // 2
+    planes = planes[..., top : top + rows, left : left + columns]
+    if pick:
+        return F.interpolate(planes, shape, mode="nearest-exact")
+    return F.interpolate(planes, shape, mode="bilinear", antialias=True)
 
 
 def _photograph(name: str) -> Callable[[], tuple[np.ndarray, float | Tensor]]:

@@ -38,11 +38,16 @@ LAYERS = [
     {"kcam.__main__"},
 ]
 LAYER = {module: index for index, row in enumerate(LAYERS) for module in row}
-DATA = [{"cube"}, {"bands"}, {"readers", "patches"}, {"convert", "inspection", "dataset", "export"}]
+DATA = [{"cube"}, {"bands"}, {"readers", "patches"}, {"convert", "inspection", "dataset", "export", "photos"}]
 """The same inside kcam.data: readers do not know of the store, nor the store of readers."""
-METHODS = {("kcam.camera", "kcam.planner"), ("kcam.camera", "kcam.linear"), ("kcam.optics", "kcam.plots")}
+METHODS = {
+    ("kcam.camera", "kcam.planner"),
+    ("kcam.camera", "kcam.linear"),
+    ("kcam.optics", "kcam.plots"),
+    ("kcam.scene", "kcam.data"),
+}
 """camera.plan(...) is a method for the user's sake, but a planner is made of cameras: imported when it is called; so
-are the operator of camera.linear(...) and the figure of lens.draw().
+are the operator of camera.linear(...), the figure of lens.draw(), and the files of Scene.from_folder(...).
 """
 FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath", "zarr"}
 """Not among the core dependencies: the library needs none of them at import, nor at run time."""

@@ -5,9 +5,11 @@ from kcam.data.cube import Cube, CubeError, write_cube
 from kcam.data.dataset import Patch, PatchDataset
 from kcam.data.export import export_patches
 from kcam.data.patches import Settings, StoreError, extract, make_plan, verify
+from kcam.data.photos import Photo, PhotoDataset, read_depth
 from kcam.data.readers import FORMATS, read_cube
 
 __all__ = [
-    "FORMATS", "PROFILES", "Cube", "CubeError", "Patch", "PatchDataset", "Settings", "StoreError", "export_patches",
-    "extract", "make_plan", "parse_bands", "read_cube", "resampling", "verify", "write_cube",
+    "FORMATS", "PROFILES", "Cube", "CubeError", "Patch", "PatchDataset", "Photo", "PhotoDataset", "Settings",
+    "StoreError", "export_patches", "extract", "make_plan", "parse_bands", "read_cube", "read_depth", "resampling",
+    "verify", "write_cube",
 ]  # fmt: skip
