@@ -143,7 +143,9 @@ def pipeline_figure(
 
     Args:      subtitle: None for the lens, the scene's size and distance, and the time in all.
     """
-    panels, behind, seconds = [], [], 0.0
+    panels: list[_Panel] = []
+    behind: list[nn.Module] = []
+    seconds = 0.0
     context = camera.resolve(scene)
     for number, step in enumerate(taken, start=1):
         behind += step.stages
@@ -206,7 +208,8 @@ def looked(
     if not isinstance(signal, Tensor) or signal.ndim != 4 or 0 in signal.shape:
         return Look(None, None)
     planes = signal[0].detach().float().cpu().nan_to_num(0, 0, 0)
-    tile, shown = _tile(planes, behind), ()
+    tile = _tile(planes, behind)
+    shown: tuple[str, ...] = ()
     if tile is None:
         planes, shown = _as_colours(planes, behind, context)
     if not _is_coded(behind):
@@ -423,7 +426,8 @@ def _psf_rows(imaging: optics.Imaging, scene: Scene) -> list[_PSFRow]:
     wavelengths = torch.tensor(middles, dtype=torch.float64)
     vergences = 1 / torch.tensor(distances, dtype=torch.float64)
     shape = imaging.psf_window(wavelengths, vergences=vergences, picture=(scene.shape[1], scene.shape[2]))
-    pixels = imaging.pixels(tuple(min(side, _LARGEST_PSF) | 1 for side in shape), torch.empty(0, device=scene.device))
+    rows, columns = (min(side, _LARGEST_PSF) | 1 for side in shape)
+    pixels = imaging.pixels((rows, columns), torch.empty(0, device=scene.device))
     if not has_field:
         found = imaging.bank(Points(vergences), wavelengths, pixels)
         labels = [metres(each) for each in distances]
