@@ -349,9 +349,10 @@ def _facts(signal: Any, behind: Sequence[nn.Module]) -> tuple[str, str]:
     if not isinstance(signal, Tensor):
         return type(signal).__name__, ""
     values = signal[0].detach() if signal.ndim else signal.detach()
-    finite = values[values.isfinite()]
-    span = f"{float(finite.min()):.3g} to {float(finite.max()):.3g} {_unit(behind)}" if finite.numel() else ""
-    lost = values.numel() - finite.numel()
+    lost = int((~values.isfinite()).sum())
+    finite = values[values.isfinite()] if lost else values
+    low, high = (float(end) for end in finite.aminmax()) if finite.numel() else (0.0, 0.0)
+    span = f"{low:.3g} to {high:.3g} {_unit(behind)}" if finite.numel() else ""
     return _times(values.shape) or "a number", f"{span}{f', {lost} not finite' if lost else ''}"
 
 
