@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -49,6 +50,11 @@ def call(name: str, *arguments: object, status: int = 0) -> str:
     assert result.exit_code == status, (result.output, result.exception)
     assert "Traceback" not in result.output
     return result.output
+
+
+def quiet(text: str) -> str:
+    """The standard error without lines of progress, of which a slow machine sees some."""
+    return re.sub(r"^(convert|inspect|extract|verify|export) \d+( of \d+)?, .*\n", "", text, flags=re.MULTILINE)
 
 
 def start(name: str, *arguments: object) -> subprocess.Popen[str]:

@@ -330,7 +330,7 @@ def test_as_a_process_it_is_quiet_without_a_terminal(tmp_path: Path) -> None:
     assert done.returncode == 1
     name = written.path.stem
     assert done.stdout.splitlines()[0].startswith(f"{name}: 28 x 12 x 17, ")
-    assert done.stderr.splitlines() == [
+    assert stores.quiet(done.stderr).splitlines() == [
         f"failed: {tmp_path / 'bad.npz'}: it cannot be read as npz: BadZipFile: File is not a zip file"
     ]
     assert "\x1b" not in done.stdout + done.stderr
