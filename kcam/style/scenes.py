@@ -21,6 +21,7 @@ from torch import Tensor
 from kcam import spectral
 from kcam.data import PatchDataset
 from kcam.data.patches.plan import fingerprint
+from kcam.data.photos import PICTURES
 from kcam.scene import PHOTOGRAPHS, Scene, read_picture
 from kcam.style.generators import philox
 
@@ -33,7 +34,6 @@ TINT = 1.5
 DISTANCE = 2.0
 LONGEST = 512
 """Pixels on the longer side of a user's photograph at scale 1: about as many as the built-in ones have."""
-PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 KEPT = 2**30
 """Bytes of photographs that are kept shrunk, of two hundred or so: else each would be decoded for each crop."""
 
@@ -223,13 +223,13 @@ def _pictures(folder: Path) -> list[Path]:
             path = Path(inside, name)
             if name.startswith(".") or not path.is_file():
                 continue
-            if path.suffix.lower() in PHOTO_SUFFIXES:
+            if path.suffix.lower() in PICTURES:
                 found.append(path)
             else:
                 others += 1
     if not found:
         more = f", and there are {others} other files" if others else ""
-        raise ValueError(f"there is no picture in the folder {folder}: expected {', '.join(PHOTO_SUFFIXES)}{more}.")
+        raise ValueError(f"there is no picture in the folder {folder}: expected {', '.join(PICTURES)}{more}.")
     return found
 
 
