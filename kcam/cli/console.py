@@ -92,8 +92,9 @@ class Lines:
         waited, moved = now - self._last, abs(self._done - self._told)
         if waited >= SELDOM or (waited >= OFTEN and self.total is not None and moved >= SHARE * self.total):
             left = time_left(self._marks, self.total)
-            parts = (_count(self.what, self._done, self.total), note, rounded(now - self._began))
-            self._write(", ".join(part for part in parts if part) + (f", {rounded(left)} left" if left and left >= 0.5 else ""))
+            rest = f"{rounded(left)} left" if left is not None and left >= 0.5 else ""
+            parts = (_count(self.what, self._done, self.total), note, rounded(now - self._began), rest)
+            self._write(", ".join(part for part in parts if part))
             self._last, self._told = now, self._done
 
 
