@@ -183,8 +183,9 @@ for method, weights in taps.items():
     assert math.isclose(kept, expected, rel_tol=0.04)
 
 # %%
-# ``menon`` looks for the calmer direction, and noise misleads it. So photograph the astronaut in less and less light:
-# at ISO 100 a white pixel has 8000 electrons, at ISO 25 600 there are 31.
+# ``menon`` looks for the calmer direction, and noise misleads it. So photograph the astronaut in less and less light.
+# ``Exposure(iso=)`` keeps the brightness of the picture: white fills 0.8 of the well at ISO 100, and an ISO that is
+# larger by a factor means so much less light.
 
 isos = (100, 400, 1600, 6400, 25600)
 electronics = (sensor.ShotNoise(full_well=10_000), sensor.ReadNoise(3.0), sensor.ADC(bits=12))
@@ -198,6 +199,7 @@ ax.set_xticks(isos, isos)
 ax.minorticks_off()
 ax.legend(frameon=False)
 
+print("electrons of white:", ", ".join(f"{0.8 * 10_000 * 100 / iso:.0f}" for iso in isos))
 lead = np.subtract(curves["menon"], curves["difference"])
 print("menon is better than difference by", ", ".join(f"{gain:+.1f}" for gain in lead), "dB")
 assert lead[0] > 4
@@ -209,11 +211,12 @@ assert lead[-1] < 0.5
 #
 # Aliasing cannot be undone afterwards, but it can be prevented: what does not reach the sensor has no alias. A lens of
 # f-number :math:`N` ends at the frequency :math:`1 / \lambda N` (lesson 2). It spares the red and blue pixels all
-# aliases where this is :math:`1 / 4p`, so at :math:`N = 4p / \lambda`. That is f/29 for pixels of 4 µm in green light,
-# and long before it the contrast near the cutoff is low.
+# aliases where this is :math:`1 / 4p`, so at :math:`N = 4p / \lambda`. Long before that the contrast near the cutoff
+# is low.
 
 chart = Scene.from_rgb(zone_plate[:, :1].float(), depth=math.inf)
 stops, seen = (4, 8, 16, 32), []
+print(f"4 p / lambda = {4 * 4 * um / (550 * nm):.0f} for pixels of 4 um in green light")
 for stop in stops:
     lens = optics.Lens(optics.CircularAperture(20 * mm / stop), optics.ThinLens(20 * mm), focus_distance=math.inf)
     camera = Camera(
@@ -232,8 +235,8 @@ for ax, stop, picture in zip(axes, stops, seen, strict=True):
     ax.axis("off")
 
 # %%
-# Cameras with large pixels have a plate of birefringent quartz before the sensor for this, the optical low-pass filter.
-# Pixels of 1 µm behind f/1.8 have it for free.
+# Some cameras have a plate of birefringent quartz before the sensor for this, the optical low-pass filter. It splits each
+# ray in four, a pixel apart, and does not darken the picture as a small aperture does.
 #
 # Exercises
 # ---------
