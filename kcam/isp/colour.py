@@ -68,6 +68,11 @@ def as_shot_gains(context: Context, *, channels: int = 3) -> Tensor:
                channels, green alone for 1) and D65.  channels: C of the signal.
     Returns:   (C,) float64, 1 in green (channel 1, or the only one); differentiable in the filter.
     Raises:    ValueError if the filter has not one curve per channel.
+
+    Example:
+    >>> red, green, blue = isp.as_shot_gains(kcam.Context(colour_filter=sensor.ColourFilter.nikon()))
+    >>> round(float(red), 2), round(float(green), 2), round(float(blue), 2)  # in daylight
+    (1.65, 1.0, 1.18)
     """
     colour_filter = _filter_of(context, channels)
     white = colour_filter.white(context.wavelengths, illuminant=context.illuminant).clamp(min=LEAST_WHITE)
@@ -76,7 +81,12 @@ def as_shot_gains(context: Context, *, channels: int = 3) -> Tensor:
 
 @in_float32
 def white_balance(signal: Tensor, *, gains: Tensor) -> Tensor:
-    """Multiply each channel of (..., C, H, W) by its gain, (C,)."""
+    """Multiply each channel of (..., C, H, W) by its gain, (C,).
+
+    Example:
+    >>> isp.white_balance(torch.ones(3, 1, 1), gains=torch.tensor([2.0, 1.0, 1.5])).flatten().tolist()
+    [2.0, 1.0, 1.5]
+    """
     channels = _channels(signal)
     if gains.shape != (channels,):
         raise ValueError(
@@ -103,6 +113,10 @@ class WhiteBalance(Stage):
     Args:      gains: (C,), a tensor or a sequence; an nn.Parameter trains. None for `as_shot_gains`: the light of the
                scene, as the colour filter sees it.
     Raises:    TypeError, ValueError for gains that are not one number per channel.
+
+    Example:
+    >>> isp.WhiteBalance([2.0, 1.0, 1.5])(torch.full((1, 3, 1, 1), 0.5)).flatten().tolist()
+    [1.0, 0.5, 0.75]
     """
 
     gains: Tensor | None
@@ -137,6 +151,12 @@ def fit_colour_matrix(signals: Tensor, *, colours: Tensor, noise: float = NOISE)
     Args:      signals: (K,C), white balanced, a perfect white = 1.  colours: (K,3) linear sRGB.
                noise: RMS noise of the signals to guard against, > 0.
     Returns:   (3,C) in the dtype of the signals; differentiable.
+
+    Example:
+    >>> colours = torch.rand(24, 3, generator=torch.Generator().manual_seed(0)).double()
+    >>> matrix = isp.fit_colour_matrix(colours, colours=colours)
+    >>> torch.allclose(matrix, torch.eye(3).double(), atol=1e-3), torch.allclose(matrix.sum(1), torch.ones(3).double())
+    (True, True)
     """
     count, channels = signals.shape
     identity = torch.eye(channels, dtype=signals.dtype, device=signals.device)
@@ -156,6 +176,11 @@ def as_shot_colour_matrix(context: Context, *, channels: int = 3) -> Tensor:
     Returns:   (3,C) float64: an exposed (white_share), balanced signal to linear sRGB, a perfect white to (1,1,1);
                differentiable in the filter.
     Raises:    ValueError if the filter has not one curve per channel.
+
+    Example:
+    >>> matrix = isp.as_shot_colour_matrix(kcam.Context())
+    >>> [round(float(row.sum()), 3) for row in matrix]  # an exposed white, 0.8, becomes 1
+    [1.25, 1.25, 1.25]
     """
     wavelengths = context.wavelengths
     weights = _filter_of(context, channels).contraction(wavelengths)
@@ -172,7 +197,13 @@ def as_shot_colour_matrix(context: Context, *, channels: int = 3) -> Tensor:
 
 @in_float32
 def apply_colour_matrix(signal: Tensor, *, matrix: Tensor) -> Tensor:
-    """(..., C, H, W) to (..., N, H, W) by a matrix (N,C) on the channels of each pixel."""
+    """(..., C, H, W) to (..., N, H, W) by a matrix (N,C) on the channels of each pixel.
+
+    Example:
+    >>> luminance = torch.tensor([[0.2126, 0.7152, 0.0722]])  # of linear sRGB
+    >>> round(float(isp.apply_colour_matrix(torch.ones(3, 1, 1), matrix=luminance)), 4)  # of white
+    1.0
+    """
     channels = _channels(signal)
     if matrix.ndim != 2 or matrix.shape[1] != channels:
         raise ValueError(
@@ -188,6 +219,11 @@ class ColourMatrix(Stage):
     Args:      matrix: (3,C), a tensor or rows; an nn.Parameter trains. None for `as_shot_colour_matrix`, fitted for the
                context's filter and light. It counts on a white balanced signal. A signal of one channel becomes gray.
     Raises:    TypeError, ValueError for a matrix that has not three rows.
+
+    Example:
+    >>> white = torch.full((1, 3, 1, 1), 0.8)  # balanced and exposed: 0.8 of full scale
+    >>> torch.allclose(isp.ColourMatrix()(white), torch.ones(1, 3, 1, 1), atol=1e-5)
+    True
     """
 
     matrix: Tensor | None
@@ -228,6 +264,10 @@ def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor 
                0.1 to 10 and -0.49 to 0.49, with the gradients of `clip_ste` beyond.
     Returns:   same shape, in [0,1]. The gradient is finite everywhere; beyond the clip it is that of `clip_ste`.
     Raises:    ValueError for another number of channels.
+
+    Example:
+    >>> [round(float(isp.tone_curve(torch.full((1, 1, 1), value))), 3) for value in (0.0, 0.214, 1.0)]
+    [0.0, 0.5, 1.0]
     """
     check_signal(signal, channels=(1, 3))
     channels = _channels(signal)
@@ -259,6 +299,12 @@ def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
 
     Args:      signal: any shape.  gamma: 0.1 to 10, above 1 darkens.  contrast: c, -0.49 to 0.49. Both broadcast
                against the signal, and are not checked.
+
+    Example:
+    >>> tones = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
+    >>> curve = isp.render_tones(tones, gamma=torch.tensor(1.0), contrast=torch.tensor(0.4))
+    >>> [round(float(tone), 3) for tone in curve]  # an S: darker below the middle, lighter above it
+    [0.0, 0.175, 0.5, 0.825, 1.0]
     """
     offset = 0.01
     low = offset**gamma
@@ -273,6 +319,11 @@ class ToneCurve(Stage):
                as nn.Parameter(torch.ones(3)) and nn.Parameter(torch.zeros(3)), which change nothing. None: 1 and 0.
     Raises:    TypeError, ValueError for other shapes, a gamma outside 0.1..10, or a contrast outside -0.49..0.49, but
                for an nn.Parameter, which is taken as the bound that it was trained beyond.
+
+    Example:
+    >>> gray = torch.full((1, 3, 1, 1), 0.2140)  # linear
+    >>> round(float(isp.ToneCurve()(gray)[0, 0]), 3), round(float(isp.ToneCurve(gamma=2.0)(gray)[0, 0]), 3)
+    (0.5, 0.255)
     """
 
     gamma: Tensor | None
@@ -302,7 +353,12 @@ def _within(value: Tensor | float | None, name: str, low: float, high: float) ->
 
 
 class Clip(Stage):
-    """Clip to 0..1 with the gradient of `clip_ste`, as between the layers of the thesis's network."""
+    """Clip to 0..1 with the gradient of `clip_ste`, as between the layers of the thesis's network.
+
+    Example:
+    >>> isp.Clip()(torch.tensor([-0.5, 0.5, 1.5])).tolist()
+    [0.0, 0.5, 1.0]
+    """
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """Any shape."""

@@ -18,6 +18,11 @@ def convolve_planes(signal: Tensor, *, weight: Tensor, bias: Tensor) -> Tensor:
     Args:      signal: (..., C, H, W), continued by its border.  weight: (N,C,k,k), k odd.  bias: (N,).
     Returns:   (..., N, H, W).
     Raises:    ValueError for another number of channels.
+
+    Example:
+    >>> mean = torch.ones(1, 3, 3, 3) / 27
+    >>> torch.allclose(isp.convolve_planes(torch.ones(3, 8, 8), weight=mean, bias=torch.zeros(1)), torch.ones(1, 8, 8))
+    True
     """
     channels = weight.shape[1]
     if signal.ndim < 3 or signal.shape[-3] != channels:
@@ -42,6 +47,12 @@ class Convolution(Stage):
 
     Args:      weight: (N,C,k,k), k odd, and bias: (N,); None for trainable ones, 3 x 3 x 3 x 3, at the identity.
     Raises:    ValueError for other shapes.
+
+    Example:
+    >>> picture = torch.rand(1, 3, 8, 8)
+    >>> stage = isp.Convolution()
+    >>> torch.allclose(stage(picture), picture), sum(p.numel() for p in stage.parameters())  # 3 x 3 x 3 x 3 + 3
+    (True, 84)
     """
 
     weight: Tensor

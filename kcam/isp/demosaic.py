@@ -288,6 +288,11 @@ class DemosaicMethod:
                psnr: in the domain "sqrt", on RGGB, without noise, measured as in `demosaic` [dB].
                cost: forward time relative to malvar's, 1024 x 1024, CPU, one thread.
                note: when to take it.
+
+    Example:
+    >>> row = isp.DEMOSAICS["malvar"]
+    >>> row.bayer_only, row.cost
+    (True, 1.0)
     """
 
     function: Callable[..., Tensor]
@@ -401,6 +406,12 @@ def demosaic(
     Returns:   (..., C, H, W), C = 3, or 4 with a white channel, on the scale of the input; not clipped.
     Raises:    ValueError for an unknown pattern, method or domain, a method that is not valid for the pattern, or
                another number of channels; TypeError for integers.
+
+    Example:
+    >>> raw = sensor.mosaic(torch.rand(3, 8, 8), pattern="RGGB")
+    >>> picture = isp.demosaic(raw, pattern="RGGB")
+    >>> torch.allclose(sensor.mosaic(picture, pattern="RGGB"), raw, atol=1e-6)  # what was recorded stays
+    True
     """
     row = _row(method, pattern)
     _check_domain(domain)
@@ -433,6 +444,11 @@ class Demosaic(Stage):
                gains: (C,) to balance with; None to take those of the context's filter and light. Without a filter in
                the context the plane counts as balanced already.
     Raises:    ValueError as `demosaic`.
+
+    Example:
+    >>> gray = torch.full((1, 1, 8, 8), 0.5)
+    >>> torch.allclose(isp.Demosaic("bilinear")(gray), torch.full((1, 3, 8, 8), 0.5), atol=1e-6)
+    True
     """
 
     domain: str
@@ -486,6 +502,11 @@ def learned_demosaic(mosaic: Tensor, *, weight: Tensor, bias: Tensor) -> Tensor:
     Returns:   (..., N, H, W).
     Valid when a style is wanted rather than a true picture: one kernel for all phases of a mosaic cannot tell red from
                green, and trained for style it leaves the mosaic's pattern in the picture.
+
+    Example:
+    >>> mean = torch.ones(3, 1, 3, 3) / 9
+    >>> torch.allclose(isp.learned_demosaic(torch.ones(1, 8, 8), weight=mean, bias=torch.zeros(3)), torch.ones(3, 8, 8))
+    True
     """
     _check_mosaic(mosaic)
     planes = mosaic.reshape(-1, *mosaic.shape[-3:])
@@ -504,6 +525,10 @@ class LearnedDemosaic(Stage):
 
     Args:      weight: (N,1,3,3) and bias: (N,); None for trainable ones as above, N = 3.
     Raises:    ValueError for other shapes.
+
+    Example:
+    >>> isp.LearnedDemosaic()(torch.rand(1, 1, 8, 8)).shape
+    torch.Size([1, 3, 8, 8])
     """
 
     weight: Tensor

@@ -72,6 +72,12 @@ class Accuracy(Recipe):
         direct: convolve in the picture, without a Fourier transform: faster for small windows.
     Raises: ValueError for an unknown propagator, coverage or precision, a shape, count or memory that is not positive,
         a distance not in metres, a kappa of 1 or less; TypeError for layers that are neither a number nor distances.
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
+    >>> imaging = optics.Imaging(lens, accuracy=optics.Accuracy(bands=4, occlusion=False))
+    >>> imaging.psf_wavelengths(kcam.units.wavelength_grid()).shape
+    torch.Size([4])
     """
 
     blur: bool = True

@@ -82,6 +82,12 @@ class Imaging(Stage):
         accuracy: what is computed and what is left out, an `Accuracy`; shortcuts: its arguments one by one, over those.
             Each is an attribute of the stage too, and may be set.
     Raises: ValueError for an unknown border, a pitch or distance not in metres, and what `Accuracy` refuses.
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
+    >>> picture = optics.Imaging(lens, pixel_pitch=4 * um)(torch.ones(1, 28, 64, 64))
+    >>> picture.shape, bool((picture - 1).abs().max() < 0.02)  # an even wall stays even
+    (torch.Size([1, 28, 64, 64]), True)
     """
 
     def __init__(

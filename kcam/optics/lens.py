@@ -75,6 +75,11 @@ class Lens(ElementStack):
     Raises:
         ValueError for no or two apertures, both or neither distance, a focus inside the focal length, r >= R.
         TypeError for something that is no element.
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
+    >>> f"{lens.sensor_distance / mm:.2f} mm, f/{lens.f_number:.1f}"  # 1 / d = 1 / f - 1 / z
+    '51.28 mm, f/10.3'
     """
 
     varies = False

@@ -67,6 +67,14 @@ class MeasuredPSF(nn.Module):
     Raises:  TypeError, ValueError for shapes that do not fit, NaN, negative light, lengths that are not in metres; at
         the first picture for wavelengths of the scene that were not measured.
     Valid where the light of a pixel of the scene is the same over the PSF's place of the picture.
+
+    Example:
+    >>> point = torch.zeros(1, 2, 5, 5)
+    >>> point[..., 2, 2] = 1.0  # all light in the middle: a perfect lens
+    >>> lens = optics.MeasuredPSF(point, wavelengths=[450 * nm, 650 * nm], distances=2.0, pixel_pitch=4 * um)
+    >>> scene = Scene.from_bands(torch.rand(1, 2, 16, 16), wavelengths=[450 * nm, 650 * nm], depth=2.0)
+    >>> torch.allclose(optics.Imaging(lens, pixel_pitch=4 * um)(scene), scene.bands(), atol=1e-5)
+    True
     """
 
     psfs: Tensor

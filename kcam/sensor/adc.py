@@ -34,6 +34,10 @@ def quantise(
            rounding: False leaves the steps out.
     Returns:   same shape, 1.0 = full scale (2^bits - 1 DN).
     Valid when the dtype holds the steps: float16 has 11 bits, bfloat16 8, and is given back with those.
+
+    Example:
+    >>> [round(float(15 * sensor.quantise(torch.tensor(share), bits=4)), 3) for share in (0.0, 0.31, 1.7)]  # DN of 15
+    [0.0, 5.0, 15.0]
     """
     top = 2**bits - 1
     level = clip_ste(signal * like(gain, signal) + like(black_level, signal) / top, 0.0, 1.0)
@@ -49,6 +53,11 @@ class ADC(Stage):
                gain: analogue gain, > 0; None to take it from the context (ISO / 100).
            rounding: False leaves the steps out, as a `Plan` may.
     Raises:    TypeError for bits that are no integer; ValueError for a value out of range.
+
+    Example:
+    >>> adc = sensor.ADC(bits=12, black_level=64)
+    >>> (4095 * adc(torch.tensor([0.0, 0.5, 2.0]))).tolist()  # DN: black, half of the well, clipped
+    [64.0, 2112.0, 4095.0]
     """
 
     bits: int

@@ -84,6 +84,12 @@ def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
     Raises:    ValueError for wavelengths out of range, curves of another shape or not finite, and a green that is 0,
                or that the Gaussians, centred between 420 and 720 nm, do not reach.
     Source:    Lawson and Hanson, Solving Least Squares Problems (1974), chapter 23: NNLS, as in scipy.
+
+    Example:
+    >>> wavelengths = torch.arange(400, 741, 10).double() * nm
+    >>> fit = sensor.fit_gaussians(spectral.sensitivity("kodak", wavelengths=wavelengths), wavelengths=wavelengths)
+    >>> fit.coefficients.shape, max(fit.errors) < 0.02
+    (torch.Size([3, 12]), True)
     """
     from scipy.optimize import nnls  # comes with scikit-image; imported late, since few users need it
 
@@ -139,6 +145,12 @@ class ColourFilter(Stage):
                    `infrared_transmission`; None for no cut beyond what the curves themselves hold.
     Raises:    ValueError for coefficients of another shape, negative or not finite, or a length out of range;
                TypeError for coefficients that are no floating-point tensor.
+
+    Example:
+    >>> wavelengths = kcam.units.wavelength_grid(count=31)  # 420 to 720 nm in steps of 10 nm
+    >>> response = sensor.ColourFilter.nikon().response(wavelengths)
+    >>> [round(float(wavelengths[band] / nm)) for band in response.argmax(1)]  # peaks of red, green, blue
+    [610, 530, 460]
     """
 
     coefficients: Tensor

@@ -100,6 +100,11 @@ class Exposure(Stage):
                iso: sensitivity, gain = iso / 100; None for the context's gain (1).
                quantum_efficiency: peak of green [electrons / photon], 0 < q <= 1; only used with `time`.
     Raises:    ValueError for a value out of range, and at the call for `time` without a lens in the context.
+
+    Example:
+    >>> white = sensor.ColourFilter.kodak().white(kcam.Context().wavelengths)[None, :, None, None]
+    >>> [round(float(sensor.Exposure(iso=iso)(white)[0, 1]), 3) for iso in (100, 800)]  # of the full well, in green
+    [0.8, 0.1]
     """
 
     white_share: Tensor | float | None

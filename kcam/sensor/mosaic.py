@@ -42,6 +42,10 @@ def channel_masks(pattern: str, height: int, width: int, *, device: torch.device
     Args:      pattern: a name in `PATTERNS`.  height, width: of the picture, >= 0 pixels, odd ones too.
     Returns:   (C, height, width) bool; at every pixel exactly one channel is True.
     Raises:    ValueError for an unknown pattern.
+
+    Example:
+    >>> sensor.channel_masks("RGGB", 4, 4).sum((1, 2)).tolist()  # green twice
+    [4, 8, 4]
     """
     tile = pattern_tile(pattern).to(device)
     channels = int(tile.max()) + 1
@@ -58,6 +62,11 @@ def mosaic(signal: Tensor, *, pattern: str) -> Tensor:
     Args:      signal: (..., C, H, W), C = 3, or 4 for "rgbw".  pattern: a name in `PATTERNS`.
     Returns:   (..., 1, H, W), values unchanged; the gradient is 1 at the kept channel, 0 elsewhere.
     Raises:    ValueError for an unknown pattern or another number of channels; TypeError for integers.
+
+    Example:
+    >>> channels = torch.arange(3.0)[:, None, None].expand(3, 2, 4)  # red 0, green 1, blue 2
+    >>> sensor.mosaic(channels, pattern="GBRG").tolist()
+    [[[1.0, 2.0, 1.0, 2.0], [0.0, 1.0, 0.0, 1.0]]]
     """
     check_signal(signal)
     tile = pattern_tile(pattern)
@@ -77,7 +86,13 @@ def mosaic(signal: Tensor, *, pattern: str) -> Tensor:
 
 
 class Mosaic(Stage):
-    """The colour filter array as a stage: `mosaic` with a named pattern. Any height and width, odd ones too."""
+    """The colour filter array as a stage: `mosaic` with a named pattern. Any height and width, odd ones too.
+
+    Example:
+    >>> channels = torch.arange(3.0)[None, :, None, None].expand(1, 3, 4, 4)  # red 0, green 1, blue 2
+    >>> sensor.Mosaic("RGGB")(channels)[0, 0, :2].tolist()
+    [[0.0, 1.0, 0.0, 1.0], [1.0, 2.0, 1.0, 2.0]]
+    """
 
     def __init__(self, pattern: str = "RGGB"):
         super().__init__()

@@ -132,6 +132,14 @@ def poisson(electrons: Tensor, *, generator: torch.Generator | None = None) -> T
                generator: source of the draw, on the device of `electrons`; None for torch's default one.
     Returns:   whole numbers in the dtype of `electrons`. Above 2^40 they are normal: what is left of the Poisson's
                skewness there is 1e-6.
+
+    Example:
+    >>> electrons = torch.full((400, 400), 100.0, requires_grad=True)
+    >>> counts = sensor.poisson(electrons, generator=torch.Generator().manual_seed(0))
+    >>> counts.mean().backward()
+    >>> counts = counts.detach()
+    >>> round(float(counts.mean())), round(float(counts.std())), round(float(electrons.grad.sum()), 2)
+    (100, 10, 1.0)
     """
     return _Poisson.apply(electrons, generator)
 
@@ -158,6 +166,12 @@ def shot_noise(signal: Tensor, *, full_well: Tensor | float, generator: torch.Ge
                generator: see `poisson`.
     Returns:   counted electrons as a share of the full well, 0..1.
     Source:    EMVA 1288 release 4.0, eq. (1): photon noise.
+
+    Example:
+    >>> light = torch.full((400, 400), 0.01)  # 100 of 10 000 electrons
+    >>> counts = 10_000 * sensor.shot_noise(light, full_well=10_000, generator=torch.Generator().manual_seed(0))
+    >>> round(float(counts.mean())), round(float(counts.std()))
+    (100, 10)
     """
     capacity = like(full_well, signal)
     rate = clip_ste(signal, 0.0, OVERFLOWING) * capacity
@@ -179,6 +193,12 @@ def read_noise(
     Args:      signal: share of the full well.  sigma_electrons: temporal dark noise sigma_d, >= 0 [electrons].
                full_well: saturation capacity [electrons].  generator: see `poisson`.
     Returns:   share of the full well, no longer bounded: the ADC clips it.
+
+    Example:
+    >>> noise = sensor.read_noise(torch.zeros(1000, 1000), sigma_electrons=3.0, full_well=10_000,
+    ...                           generator=torch.Generator().manual_seed(0))
+    >>> round(10_000 * float(noise.std()), 1)  # electrons
+    3.0
     """
     noise = torch.randn(signal.shape, generator=generator, dtype=signal.dtype, device=signal.device)
     return signal + noise * (like(sigma_electrons, signal) / like(full_well, signal))
@@ -225,6 +245,12 @@ def dark_current(
     Args:      signal: share of the full well.  electrons: expected dark electrons, see `dark_electrons`.
                full_well: saturation capacity [electrons].  generator: see `poisson`.
     Returns:   share of the full well, <= 1.
+
+    Example:
+    >>> dark = torch.zeros(400, 400)
+    >>> counts = sensor.dark_current(dark, electrons=9.0, full_well=10_000, generator=torch.Generator().manual_seed(0))
+    >>> round(10_000 * float(counts.mean()), 1), round(10_000 * float(counts.std()), 1)  # 9 and its root
+    (9.0, 3.0)
     """
     capacity = like(full_well, signal)
     rate = torch.zeros_like(signal) + like(_overflowing(electrons, full_well), signal)
@@ -258,6 +284,12 @@ def fixed_pattern(
                seed: names the sensor: one seed and (C,H,W) give the same fields in every frame and on every device.
     Returns:   share of the full well.
     Source:    EMVA 1288 release 4.0, PRNU and DSNU (white, without its column and row parts).
+
+    Example:
+    >>> gray = torch.full((1, 64, 64), 0.5)
+    >>> one, other = (sensor.fixed_pattern(gray, prnu=0.0, dsnu=20.0, full_well=10_000, seed=seed) for seed in (0, 1))
+    >>> round(10_000 * float((one - other).std() / 2**0.5))  # electrons: two sensors differ by both their spreads
+    20
     """
     gain, offset = fixed_pattern_fields(tuple(signal.shape[-3:]), seed=seed).to(signal)
     return signal * (1 + like(prnu, signal) * gain) + offset * (like(dsnu, signal) / like(full_well, signal))
@@ -268,7 +300,13 @@ def _rms(signal: Tensor) -> float:
 
 
 class Mean(Stage):
-    """A random stage at its mean: it holds that stage, so parameters are shared, and calls its `expected`."""
+    """A random stage at its mean: it holds that stage, so parameters are shared, and calls its `expected`.
+
+    Example:
+    >>> noise = sensor.ShotNoise(full_well=10_000)
+    >>> sensor.Mean(noise)(torch.tensor([0.25, 1.5])).tolist()  # as expected, up to the full well
+    [0.25, 1.0]
+    """
 
     def __init__(self, stage: RandomStage):
         super().__init__()
@@ -336,6 +374,12 @@ class ShotNoise(RandomStage):
 
     Args:      full_well: saturation capacity [electrons]; None to take it from the context (10 000).
     Raises:    ValueError for a full well <= 0.
+
+    Example:
+    >>> light = torch.full((1, 1, 400, 400), 0.5)  # 5000 electrons
+    >>> counts = 10_000 * sensor.ShotNoise(10_000)(light, generator=torch.Generator().manual_seed(0))
+    >>> round(float(counts.var() / counts.mean()), 1)  # Poisson
+    1.0
     """
 
     def __init__(self, full_well: Tensor | float | None = None):
@@ -373,6 +417,12 @@ class ReadNoise(RandomStage):
     Args:      sigma_electrons: standard deviation, >= 0 [electrons].
                full_well: saturation capacity [electrons]; None to take it from the context.
     Raises:    ValueError for a negative sigma or a full well <= 0.
+
+    Example:
+    >>> dark = torch.zeros(1, 1, 1000, 1000)
+    >>> noise = sensor.ReadNoise(3.0, full_well=10_000)(dark, generator=torch.Generator().manual_seed(0))
+    >>> round(10_000 * float(noise.std()), 1)  # electrons
+    3.0
     """
 
     sigma_electrons: Tensor | float
@@ -404,6 +454,11 @@ class DarkCurrent(RandomStage):
     Args:      see `dark_electrons`; full_well: saturation capacity [electrons]; None to take it from the context.
     Raises:    ValueError for a negative current or time, a doubling temperature or full well <= 0, or a temperature
                that is none in degrees C.
+
+    Example:
+    >>> warm = sensor.DarkCurrent(50.0, time=0.1, temperature=33.0)  # 8 degrees above 25: twice the current
+    >>> round(warm.electrons(), 6)
+    10.0
     """
 
     electrons_per_second: Tensor | float
@@ -497,6 +552,12 @@ class FixedPattern(RandomStage):
                full_well: saturation capacity [electrons]; None to take it from the context.
     Raises:    ValueError for a negative spread, a prnu above 0.5 or a full well <= 0; TypeError for a
                seed that is no integer.
+
+    Example:
+    >>> gray = torch.full((1, 1, 64, 64), 0.5)
+    >>> one, two = (sensor.FixedPattern(0.02, dsnu=0.0, seed=7)(gray) for _ in range(2))
+    >>> torch.equal(one, two), round(float((one / gray).std()), 3)  # the same sensor, 2 % PRNU
+    (True, 0.02)
     """
 
     prnu: Tensor | float

@@ -67,6 +67,12 @@ class CompoundLens(nn.Module):
     their light down to f/4, and 3e-3 at f/1.85, against a sum over rays (tests/optics/test_compound.py).
     Object points are (X / D, Y / D) with D from the paraxial entrance pupil; light falls as in `units`: a point at
     (0, +t) lands at y of about -f t.
+
+    Example:
+    >>> front = optics.Surface(radius=50 * mm, thickness=4 * mm, glass=1.5, semi_diameter=5 * mm, stop=True)
+    >>> lens = optics.CompoundLens(front, optics.Surface(), focus_distance=math.inf)
+    >>> f"{lens.focal_length() / mm:.1f} mm"  # R / (n - 1)
+    '100.0 mm'
     """
 
     surfaces: Sequence[Surface]

@@ -35,6 +35,12 @@ class Surface(nn.Module):
     Any of the numbers may be a Parameter.
     Raises: ValueError for NaN, lengths that are not in metres, an unknown glass, a stop without a semi-diameter, a
         semi-diameter beyond where the surface exists.
+
+    Example:
+    >>> parabola = optics.Surface(radius=100 * mm, conic=-1.0)
+    >>> sag = parabola.sag(torch.tensor((10 * mm) ** 2))[0]
+    >>> f"{float(sag) / mm:.3f} mm"  # r^2 / 2 R
+    '0.500 mm'
     """
 
     radius: Scalar

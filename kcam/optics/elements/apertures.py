@@ -38,6 +38,12 @@ class CircularAperture(Aperture):
 
     Args:    diameter: [m], > 0; may be a Parameter.
     Raises:  ValueError for a diameter that is not > 0, or is above 1 m (millimetres by mistake).
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=math.inf)
+    >>> psf = lens.psf([550 * nm], distances=math.inf, pixel_pitch=0.1 * um, shape=(161, 161), integrate=False)
+    >>> round(float(psf[0, 0, 80, 80:].argmin()) * 0.1, 1)  # um; Airy's first dark ring: 1.22 lambda N
+    6.7
     """
 
     symmetric = True
@@ -66,6 +72,11 @@ class AnnularAperture(Aperture):
 
     Args:    diameter: outer diameter [m]; obscuration: inner over outer diameter, 0 <= obscuration < 1.
     Raises:  ValueError outside these ranges.
+
+    Example:
+    >>> aperture = optics.AnnularAperture(10 * mm, obscuration=0.5)
+    >>> round(aperture.open_share() / optics.CircularAperture(10 * mm).open_share(), 2)
+    0.75
     """
 
     symmetric = True
@@ -98,6 +109,12 @@ class SquareAperture(Aperture):
 
     Args:    width: [m], > 0; may be a Parameter.
     Raises:  ValueError for a width that is not > 0, or is above 1 m.
+
+    Example:
+    >>> lens = optics.Lens(optics.SquareAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=math.inf)
+    >>> psf = lens.psf([550 * nm], distances=math.inf, pixel_pitch=0.5 * um, shape=(33, 33), integrate=False)
+    >>> float(psf[0, 0, 16, 16:].argmin()) * 0.5  # um; the first zero of sinc^2 is at lambda N
+    5.5
     """
 
     width: Scalar
@@ -127,6 +144,11 @@ class ApertureMap(Aperture):
         transmission: (n, n) in [0, 1], rows along +y, columns along +x; a Parameter trains.
         width: side of the square that the map spans [m].
     Raises: ValueError for a map that is not square, leaves [0, 1], has NaN, or is closed everywhere.
+
+    Example:
+    >>> diagonal = optics.ApertureMap(torch.eye(4), width=5 * mm)  # a coded aperture, a quarter of it open
+    >>> float(diagonal.open_share())
+    0.25
     """
 
     transmission: Tensor

@@ -29,6 +29,13 @@ class DOE(Element):
             through.
     Raises:  ValueError for a map that is not square or not finite, levels < 2, a wavelength not in metres, a pitch
         outside 1e-8..0.05 m.
+
+    Example:
+    >>> doe = optics.DOE((20 * torch.linspace(-1, 1, 64)).expand(64, 64))  # a prism of 20 rad at the rim
+    >>> lens = optics.Lens(optics.SquareAperture(2 * mm), optics.ThinLens(50 * mm), doe, focus_distance=math.inf)
+    >>> psf = lens.psf([550 * nm], distances=math.inf, pixel_pitch=8 * um, shape=(33, 33))
+    >>> int(psf[0, 0, 16].argmax()) - 16  # 50 mm * 550 nm * 20 / (2 pi mm) is 88 um
+    11
     """
 
     phase: Tensor
@@ -76,6 +83,13 @@ class ZernikeDOE(Element):
         design_wavelength: [m]. glass: name or index.
     Raises: ValueError for coefficients that are no vector or not finite.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976); normalised on the circle of the semi-aperture.
+
+    Example:
+    >>> tilt = optics.ZernikeDOE(torch.tensor([0.0, 5.0]))  # Z2 = 2 x: 10 rad at the rim
+    >>> lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), tilt, focus_distance=math.inf)
+    >>> psf = lens.psf([550 * nm], distances=math.inf, pixel_pitch=4 * um, shape=(33, 33))
+    >>> int(psf[0, 0, 16].argmax()) - 16  # 50 mm * 550 nm * 10 / (2 pi mm) is 44 um
+    11
     """
 
     coefficients: Tensor
@@ -104,6 +118,14 @@ class RadialDOE(Element):
         profile: (n,), n >= 4, phase at radii 0 .. semi-aperture at the design wavelength [rad]; a Parameter trains.
         design_wavelength: [m]. glass: name or index.
     Raises: ValueError for a profile shorter than 4 or not finite.
+
+    Example:
+    >>> r = torch.linspace(0, 1, 200) * mm
+    >>> parts = optics.RadialDOE(-math.pi * r**2 / (550 * nm * 100 * mm)), optics.ThinLens(100 * mm)  # one focal length
+    >>> lenses = (optics.Lens(optics.CircularAperture(2 * mm), part, sensor_distance=100 * mm) for part in parts)
+    >>> one, other = (lens.psf([550 * nm], distances=math.inf, pixel_pitch=4 * um, shape=(17, 17)) for lens in lenses)
+    >>> torch.allclose(one, other, atol=1e-5)
+    True
     """
 
     symmetric = True

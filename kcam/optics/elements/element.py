@@ -72,6 +72,14 @@ class Element(nn.Module):
     function of their arguments and of what the element and its class hold (parameters, numbers, arrays, lists, modules
     that are torch's or promise the same), that they read no global, file or clock, and draw nothing. PSFs are then kept
     until something held has another value: see `kcam.cache`.
+
+    Example:
+    >>> class Prism(optics.Element):
+    ...     def terms(self, pupil, wavelengths):
+    ...         return [(torch.ones_like(wavelengths), 2 * um * pupil.x)]  # x = 1 at the rim: 100 um on the sensor
+    >>> lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), Prism(), focus_distance=math.inf)
+    >>> int(lens.psf([550 * nm], distances=math.inf, pixel_pitch=10 * um, shape=(33, 33))[0, 0, 16].argmax()) - 16
+    10
     """
 
     symmetric = False  # rotationally, by its type: never decided from values, whose gradient need not be symmetric

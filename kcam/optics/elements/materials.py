@@ -35,6 +35,12 @@ class Glass:
 
     nd: index at 587.56 nm, above 1. vd: Abbe number, above 0.
     Raises: ValueError for others. Valid in the visible, to some 1e-3 at its ends.
+
+    Example:
+    >>> glass = optics.Glass(nd=1.5168, vd=64.2)
+    >>> index = optics.refractive_index(glass, wavelengths=torch.tensor([486.13, 587.56, 656.27]).double() * nm)
+    >>> round(float((index[1] - 1) / (index[0] - index[2])), 1)
+    64.2
     """
 
     nd: float
@@ -188,7 +194,8 @@ def refractive_index(glass: str | float | Glass, *, wavelengths: Tensor) -> Tens
                polycarbonate and ZnSe those of the default bands.
     Source:    cited for each glass in `GLASSES`; polymers are good to 1e-3, all others to 2e-5 at room temperature.
 
-    >>> round(float(refractive_index("N-BK7", wavelengths=torch.tensor([587.5618e-9], dtype=torch.float64))), 4)
+    Example:
+    >>> round(float(optics.refractive_index("N-BK7", wavelengths=torch.tensor([587.56 * nm]))), 4)
     1.5168
     """
     if isinstance(glass, Glass):

@@ -21,6 +21,11 @@ class ThinLens(Element):
 
     Args:    focal_length: [m], not 0; negative for a diverging lens; may be a Parameter.
     Raises:  ValueError for 0, NaN or inf, or above 10 m (millimetres by mistake; a tenth of a dioptre is a `Defocus`).
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=0.1)
+    >>> f"{lens.sensor_distance / mm:.1f} mm"  # 2 f to 2 f
+    '100.0 mm'
     """
 
     symmetric, knots = True, ()
@@ -65,6 +70,11 @@ class PlanoConvexLens(Element):
         aperture that reaches R.
     Valid when the lens is thin: the ray's shift inside the glass is neglected.
     Source:  Goodman, Introduction to Fourier Optics, 3rd ed., section 5.1; thesis (3.7).
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.PlanoConvexLens(25.84 * mm), focus_distance=2.0)
+    >>> f"{lens.focal_length(587.56 * nm) / mm:.2f} mm"  # R / (n - 1) with n_d = 1.5168
+    '50.00 mm'
     """
 
     symmetric, knots = True, ()
@@ -96,6 +106,13 @@ class Defocus(Element):
     it.
 
     Args: vergence: [1/m], positive as if the object came nearer; may be a Parameter. W20 = vergence * a^2 / 2.
+
+    Example:
+    >>> parts = optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), optics.Defocus(0.5)
+    >>> lens = optics.Lens(*parts, focus_distance=1.0)
+    >>> psf = lens.psf([550 * nm], distances=[1.0, 2.0], pixel_pitch=4 * um, shape=(33, 33))
+    >>> int(psf.amax((1, 2, 3)).argmax())  # the second is the sharp one: 1 / 2 + 0.5 is 1 / 1
+    1
     """
 
     symmetric = True

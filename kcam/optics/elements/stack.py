@@ -147,8 +147,8 @@ class ElementStack(nn.Module):
 
     @property
     def focus_distance(self) -> float:
-        """Object distance that is imaged onto the sensor paraxially at `focus_wavelength` [m]; inf, or < 0 if
-        virtual.
+        """Object distance that is imaged onto the sensor paraxially at `focus_wavelength`, without any `Defocus` [m];
+        inf, or < 0 if virtual.
         """
         vergence = float(self.power(wavelength_grid([self.focus_wavelength])).detach()[0]) - 1 / float(
             float64(self.sensor_distance).detach()

@@ -60,6 +60,12 @@ def batch_psf(
         limit.
     Valid in the paraxial range: 1 % where w4 = a^4 / (8 d^3 lambda) is below 0.005 waves.
     Source:    equation (3.4), and Noll, J. Opt. Soc. Am. 66, 207 (1976).
+
+    Example:
+    >>> psf = optics.batch_psf(torch.tensor([0.0, 0.3]), radii=torch.tensor([2.5, 2.5]) * mm, wavelengths=[550 * nm],
+    ...                        sensor_distance=50 * mm, pixel_pitch=4 * um, shape=(33, 33))
+    >>> psf.shape, bool((psf.sum((-2, -1)) > 0.97).all())  # all light but the tails
+    (torch.Size([2, 1, 1, 33, 33]), True)
     """
     grid = wavelength_grid(wavelengths)
     check_pixel_pitch(pixel_pitch)
