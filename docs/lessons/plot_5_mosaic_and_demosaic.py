@@ -235,8 +235,8 @@ for ax, stop, picture in zip(axes, stops, seen, strict=True):
     ax.axis("off")
 
 # %%
-# Some cameras have a plate of birefringent quartz before the sensor for this, the optical low-pass filter. It splits each
-# ray in four, a pixel apart, and does not darken the picture as a small aperture does.
+# Some cameras have a plate of birefringent quartz before the sensor for this, the optical low-pass filter. It splits
+# each ray in four, a pixel apart, and does not darken the picture as a small aperture does.
 #
 # Exercises
 # ---------
