@@ -160,6 +160,14 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
 
     Kornia transforms all rows and then throws away those that were not drawn; here they cost nothing. Half precision
     is computed in float32, outside of autocast, and given back as it came. An empty batch gives an empty one.
+
+    Example:
+    >>> from kcam.augmentation.distributions import Uniform
+    >>> class RandomDim(KC.CameraAugmentation):
+    ...     def simulate(self, signal, drawn):  # linear light
+    ...         return signal * drawn["share"].to(signal)[:, None, None, None]
+    >>> round(float(RandomDim({"share": Uniform(0.5)}, p=1.0)(torch.full((1, 3, 4, 4), 1.0))[0, 0, 0, 0]), 3)  # of sRGB
+    0.735
     """
 
     in_light = True

@@ -48,6 +48,11 @@ class RandomCamera(CameraAugmentation):
                wavelengths: of a cube's bands [m].
     Raises:    ValueError for no cameras, an unknown preset, a bad tolerance; at the call, for cameras that do not end
         in three channels, and for p < 1 where the channels change.
+
+    Example:
+    >>> augment = KC.RandomCamera(["ideal"], tolerance=0, distance=2.0)  # "phone" by default
+    >>> augment(torch.rand(2, 3, 24, 32)).shape
+    torch.Size([2, 3, 24, 32])
     """
 
     in_light = False

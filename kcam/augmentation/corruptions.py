@@ -32,7 +32,13 @@ from kcam.inputs import check_array, check_floats
 
 @dataclass(frozen=True)
 class Corruption:
-    """An augmentation and its arguments at each of the five severities."""
+    """An augmentation and its arguments at each of the five severities.
+
+    Example:
+    >>> mild = KC.CORRUPTIONS["overexposure"].build(severity=1)
+    >>> round(float(mild(torch.full((1, 3, 4, 4), 0.5))[0, 0, 0, 0]), 3)  # half a stop more light, as sRGB
+    0.586
+    """
 
     augmentation: type[K.base._AugmentationBase]
     severities: tuple[Mapping[str, Any], ...]
@@ -86,6 +92,12 @@ def corrupt(image: Any, corruption: str, *, severity: int = 1, seed: int = 0) ->
                global generator is left as it is.
     Returns:   a tensor of the shape, type and device of the picture, in [0,1].
     Raises:    ValueError for an unknown name or severity; TypeError for a path, or a seed that is no integer.
+
+    Example:
+    >>> picture = torch.rand(3, 32, 32)
+    >>> one, two = (KC.corrupt(picture, "shot_read_noise", severity=3, seed=7) for _ in range(2))
+    >>> one.shape, torch.equal(one, two)
+    (torch.Size([3, 32, 32]), True)
     """
     if isinstance(image, torch.Tensor):
         check_floats(image, name="image", takes=TAKES, channels=None)

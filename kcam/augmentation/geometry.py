@@ -123,6 +123,11 @@ class RandomLensDistortion(MovedPixels):
     Raises:    ValueError at the call where the drawn coefficients fold the picture over itself, or nearly so (the
         inverse does not converge to 0.01 pixels).
     Source:    Brown, Photogrammetric Engineering 32, 444 (1966); OpenCV's calib3d.
+
+    Example:
+    >>> warped = KC.RandomLensDistortion(k1=-0.2, p=1.0)(torch.ones(1, 3, 65, 65))[0, 0]  # barrel
+    >>> float(warped[32, 32]), float(warped[0, 0])  # the corners move in, and leave black
+    (1.0, 0.0)
     """
 
     takes_alpha = True

@@ -41,6 +41,12 @@ class RandomWhiteBalance(CameraAugmentation):
     Args:      temperature: [K], uniform in its inverse, the mired; 6504 is daylight and changes nothing.
                tint: log2 of a gain in green alone, as magenta (below 0) and green casts of lamps. Pictures only.
                wavelengths: of the channels [m].
+
+    Example:
+    >>> gray = torch.full((1, 3, 4, 4), 0.5)
+    >>> red, green, blue = KC.RandomWhiteBalance(temperature=3000.0, tint=0.0, p=1.0)(gray)[0, :, 0, 0]
+    >>> bool(red > green > blue)  # the light of a lamp, balanced for daylight
+    True
     """
 
     def __init__(
@@ -82,6 +88,11 @@ class RandomColourMatrix(CameraAugmentation):
 
     Args:      strength: standard deviation of the matrix's elements.
     Raises:    ValueError at the call for anything but 3 channels.
+
+    Example:
+    >>> white = torch.ones(1, 3, 4, 4)
+    >>> torch.allclose(KC.RandomColourMatrix(strength=0.1, p=1.0)(white), white, atol=1e-5)  # white stays
+    True
     """
 
     def __init__(
@@ -117,6 +128,11 @@ class RandomToneCurve(CameraAugmentation):
     Both keep black at 0 and white at 1 and rise everywhere; e keeps the slope at black finite.
 
     Args:      gamma: drawn uniformly in its logarithm; above 1 darkens. contrast: c, -0.49 to 0.49.
+
+    Example:
+    >>> darker = KC.RandomToneCurve(gamma=2.0, contrast=0.0, p=1.0)(torch.full((1, 3, 4, 4), 0.5))
+    >>> round(float(darker[0, 0, 0, 0]), 3)
+    0.255
     """
 
     in_light = False

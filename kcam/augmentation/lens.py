@@ -91,6 +91,11 @@ class RandomLens(MovedPixels):
                    [m]; None: see `base`.
     Raises:    ValueError, TypeError for no lens, an unknown one, numbers out of range or trained ones, an unknown
         border; FileNotFoundError, ValueError as `CompoundLens.from_file`.
+
+    Example:
+    >>> augment = KC.RandomLens("phone", reach=0.5, steps=1, p=1.0)  # one of four lenses by default
+    >>> augment(torch.rand(1, 1, 24, 24)).shape
+    torch.Size([1, 1, 24, 24])
     """
 
     in_light = True

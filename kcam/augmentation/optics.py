@@ -137,6 +137,13 @@ class RandomDefocus(RandomBlur):
     Raises:    ValueError for bounds out of range, a focus inside the focal length; at the call for a map of another
         shape or below 0.
     Valid      where `batch_psf` is: paraxial, 1 % where a^4 / (8 d^3 lambda) is below 0.005 waves.
+
+    Example:
+    >>> point = torch.zeros(1, 3, 33, 33)
+    >>> point[..., 16, 16] = 1.0
+    >>> near, far = (KC.RandomDefocus(focus=2.0, distance=z, f_number=4.0, p=1.0)(point).amax() for z in (1.9, 0.5))
+    >>> bool(near > far)  # what is farther out of focus is spread more
+    True
     """
 
     takes_depth = True
@@ -297,6 +304,13 @@ class RandomDiffraction(FocusedBlur):
 
     Args:      f_number: N, drawn uniformly in its logarithm. focal_length, pixel_pitch: [m].
                Others: as for `kcam.augmentation.optics.RandomBlur`.
+
+    Example:
+    >>> point = torch.zeros(1, 3, 33, 33)
+    >>> point[..., 16, 16] = 1.0
+    >>> red, green, blue = KC.RandomDiffraction(f_number=16.0, p=1.0)(point)[0, :, 16, 16]
+    >>> bool(red < green < blue)  # the Airy disc of red is the largest
+    True
     """
 
     def __init__(
@@ -314,6 +328,11 @@ class RandomAberration(FocusedBlur):
                f_number, focal_length, pixel_pitch: of the lens. Others: as for `kcam.augmentation.optics.RandomBlur`.
                The time rises as the square of rms, and with the aperture: seconds for a picture at 5 waves and f/2.
     Source:    Noll, J. Opt. Soc. Am. 66, 207 (1976).
+
+    Example:
+    >>> picture = torch.full((1, 3, 32, 32), 0.5)  # even stays even
+    >>> torch.allclose(KC.RandomAberration(rms=0.5, f_number=8.0, p=1.0)(picture), picture, atol=1e-3)
+    True
     """
 
     TERMS = 12  # Z4 .. Z15: all but piston and tilts, up to the fourth order
@@ -358,6 +377,13 @@ class RandomChromaticAberration(FocusedBlur):
     Args:      axial: share of a simple lens's focal shift that is left; 1 is a singlet. lateral: difference of
                    magnification between F and C light, signed. f_number, focal_length, pixel_pitch: of the lens.
                glass: a name in `optics.GLASSES`. Others: as for `kcam.augmentation.optics.RandomBlur`.
+
+    Example:
+    >>> point = torch.zeros(1, 3, 33, 33)
+    >>> point[..., 16, 16] = 1.0
+    >>> red, green, blue = KC.RandomChromaticAberration(axial=0.3, lateral=0.0, f_number=4, p=1.0)(point)[0, :, 16, 16]
+    >>> bool(green > red), bool(green > blue)  # red and blue are out of focus
+    (True, True)
     """
 
     def __init__(
@@ -428,6 +454,12 @@ class RandomVignetting(CameraAugmentation):
                shade: share of the pupil that the corner does not see.
     Warns:     UserWarning for a field of at most pi degrees, which darkens no corner: it was probably meant in radians.
     Source:    the cos^4 law: Born and Wolf, Principles of Optics, section 4.8.
+
+    Example:
+    >>> white = torch.ones(1, 3, 65, 65)
+    >>> corner = float(KC.RandomVignetting(field=60.0, shade=0.0, p=1.0)(white)[0, 0, 0, 0])
+    >>> round(((corner + 0.055) / 1.055) ** 2.4, 2), round(math.cos(math.radians(30)) ** 4, 2)  # its light
+    (0.56, 0.56)
     """
 
     def __init__(

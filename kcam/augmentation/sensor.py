@@ -33,6 +33,11 @@ class RandomBayer(CameraAugmentation):
                colour_filter: for cubes; None for `ColourFilter.kodak()`, or `rgbw()` for the pattern of that name.
                wavelengths: of a cube's bands [m].
     Raises:    ValueError for an unknown pattern or method, or none; at the call, for a cube with p < 1.
+
+    Example:
+    >>> gray = torch.full((1, 3, 16, 16), 0.5)
+    >>> torch.allclose(KC.RandomBayer("RGGB")(gray), gray, atol=1e-5)  # without colour nothing is lost
+    True
     """
 
     def __init__(
@@ -94,6 +99,12 @@ class RandomShotReadNoise(CameraAugmentation):
     Args:      iso: 100 is base, drawn uniformly in its logarithm. full_well: [electrons] at base ISO.
                read_noise: sigma_d [electrons].
     Raises:    ValueError for bounds that are not positive.
+
+    Example:
+    >>> gray = torch.full((8, 3, 64, 64), 0.5)
+    >>> low, high = (KC.RandomShotReadNoise(iso=iso, p=1.0)(gray).std() for iso in (100.0, 1600.0))
+    >>> round(float(high / low))  # the root of 16
+    4
     """
 
     def __init__(
@@ -135,6 +146,12 @@ class RandomFixedPattern(CameraAugmentation):
 
     Args:      prnu: relative spread of the gain, 0 to 0.5 (0.01 is 1 %). dsnu: spread of the offset [electrons].
                full_well: [electrons].
+
+    Example:
+    >>> gray = torch.full((1, 3, 64, 64), 0.5)
+    >>> uneven = KC.RandomFixedPattern(prnu=0.02, dsnu=0.0, p=1.0)(gray)
+    >>> round(float((((uneven + 0.055) / 1.055) ** 2.4 / 0.214).std()), 3)  # of the light
+    0.02
     """
 
     def __init__(
@@ -171,6 +188,11 @@ class RandomExposure(CameraAugmentation):
     """Over- and underexposure: linear light times 2^stops, cut off at the full well, 1.0.
 
     Args:      stops: of exposure; above 0 the highlights saturate.
+
+    Example:
+    >>> brighter = KC.RandomExposure(stops=1.0, p=1.0)(torch.full((1, 3, 4, 4), 0.5))  # sRGB: 0.214 of the light
+    >>> round(float(brighter[0, 0, 0, 0]), 3)  # 0.428 of it
+    0.686
     """
 
     def __init__(
@@ -188,6 +210,11 @@ class RandomQuantisation(CameraAugmentation):
 
     Args:      bits: (fewest, most), whole numbers 1 to 24; each number of bits is as likely.
     Raises:    ValueError for other numbers.
+
+    Example:
+    >>> steps = KC.RandomQuantisation(bits=2, p=1.0)(torch.linspace(0, 1, 100).view(1, 1, 10, 10))
+    >>> len(steps.unique())
+    4
     """
 
     def __init__(

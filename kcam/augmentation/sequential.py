@@ -52,6 +52,12 @@ class CameraSequential(K.AugmentationSequential):
     Raises:    ValueError for stages that contradict each other or stand in an impossible order, geometry between a
         mosaic and its demosaic, random_apply with stages; at the call for a depth_key that is no mask, or a module that
         changes its channels without saying so.
+
+    Example:
+    >>> picture, near = torch.rand(2, 3, 32, 32), torch.full((2, 1, 32, 32), 0.5)  # 2 m everywhere [1/m]
+    >>> augment = KC.CameraSequential(KC.RandomDefocus(p=1.0), KC.RandomBayer(), data_keys=["input", "mask"])
+    >>> [tuple(part.shape) for part in augment(picture, near)]
+    [(2, 3, 32, 32), (2, 1, 32, 32)]
     """
 
     def __init__(
