@@ -58,6 +58,12 @@ class Decision:
     error: estimated, relative RMS of the noiseless raw; of noise and rounding their own sigma, relative likewise.
     counted: whether the error is part of the plan's sum; noise and rounding are judged by themselves.
     seconds, memory: predicted for the raw, with this and all choices above [s, bytes].
+
+    Example:
+    >>> camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)
+    >>> plan = camera.plan(scene, tolerance=0.02)
+    >>> [row.effect for row in plan.decisions][:2], sum(row.error for row in plan.decisions if row.counted) <= 0.02
+    (['diffraction', 'wavelengths'], True)
     """
 
     effect: str
@@ -80,6 +86,11 @@ class Range:
     and of each range of defocus. saturated: the least light beyond what is recorded, relative likewise. darkest,
     brightest: RMS of what is recorded [share of the full well]. defocus: how the lens blurred.
     rings: the largest share of contrast in each ring about the middle of the picture, of optics that vary over it.
+
+    Example:
+    >>> known = Camera.phone().plan(Scene.from_rgb(torch.rand(3, 24, 32), depth=2.0), tolerance=0.02).range
+    >>> known.height, known.width, 1 / known.nearest
+    (24, 32, 2.0)
     """
 
     height: int
@@ -183,6 +194,14 @@ class Plan:
     trained: of which parameters; None where that was not kept.
     seconds, memory: predicted for the raw; reference_seconds, reference_memory: of the camera without the plan.
     planning_seconds: what making the plan took. measured: what `measure` found, beside what was predicted.
+
+    Example:
+    >>> camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)
+    >>> plan = camera.plan(scene, tolerance=0.02)
+    >>> plan.apply(camera)(scene).shape, plan.measure(camera, scene) <= 0.02
+    (torch.Size([1, 3, 21, 32]), True)
+    >>> print(str(plan).splitlines()[0])
+    Plan for 21 x 32 pixels, 28 bands, 2 m; tolerance 0.02
     """
 
     tolerance: float | str
@@ -319,7 +338,14 @@ def _read(text: str | bytes, wrong: str) -> Plan:
 
 
 class OutOfRange(UserWarning):
-    """A scene, or a gradient, is outside of what a plan was made for."""
+    """A scene, or a gradient, is outside of what a plan was made for.
+
+    Example:
+    >>> camera, picture = Camera.phone(), torch.rand(3, 32, 32)
+    >>> plan = camera.plan(Scene.from_rgb(picture, depth=2.0), tolerance=0.02)
+    >>> plan.outside(camera, Scene.from_rgb(picture, depth=0.5))  # what the warning says
+    'comes as near as 0.5 m; the nearest planned for was 2 m'
+    """
 
 
 class PlannedCamera(Camera):
@@ -329,6 +355,12 @@ class PlannedCamera(Camera):
     whole: the camera without the plan, which it shares all parameters with.
 
     unplanned: parameters through whose gradients the plan's shortcuts act, and that it does not know.
+
+    Example:
+    >>> camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)
+    >>> short = camera.plan(scene, tolerance=0.1).apply(camera)
+    >>> type(short).__name__, short.whole is camera
+    ('PlannedCamera', True)
     """
 
     def __init__(
@@ -394,14 +426,26 @@ class PlannedCamera(Camera):
 
 
 def noiseless_raw(camera: Camera) -> Camera:
-    """The stages whose result a tolerance is about: expected electrons after the full well, before the ADC rounds."""
+    """The stages whose result a tolerance is about: expected electrons after the full well, before the ADC rounds.
+
+    Example:
+    >>> from kcam.planner import noiseless_raw
+    >>> [type(stage).__name__ for stage in noiseless_raw(Camera.phone())]
+    ['Imaging', 'ColourFilter', 'Mosaic', 'Exposure', 'Mean', 'Mean']
+    """
     stages = list(camera)
     end = next((index for index, stage in enumerate(stages) if isinstance(stage, ENDS)), len(stages))
     return Camera(*stages[:end], context=camera.resolve()).noiseless()
 
 
 def with_imaging(camera: Camera, **arguments: Any) -> Camera:
-    """The camera with arguments of its Imaging changed, which has kept nothing; all else is shared."""
+    """The camera with arguments of its Imaging changed, which has kept nothing; all else is shared.
+
+    Example:
+    >>> from kcam.planner import with_imaging
+    >>> with_imaging(Camera.phone(), bands=4)[0].bands
+    4
+    """
     stages = [stage.changed(**arguments) if isinstance(stage, Imaging) else stage for stage in camera]
     return Camera(*stages, context=camera.context)
 
@@ -422,7 +466,14 @@ def shortened(camera: Camera, changes: Mapping[str, Any], skipped: Sequence[int]
 
 
 def relative_rms(a: Tensor, b: Tensor) -> float:
-    """sqrt(mean (a - b)^2 / mean b^2): 0 for two black pictures, and without a bound for one."""
+    """sqrt(mean (a - b)^2 / mean b^2): 0 for two black pictures, and without a bound for one.
+
+    Example:
+    >>> from kcam.planner import relative_rms
+    >>> raw = torch.rand(1, 1, 8, 8)
+    >>> round(relative_rms(1.01 * raw, raw), 4)
+    0.01
+    """
     a, b = a.detach().double(), b.detach().double()
     if not b.numel():
         return 0.0

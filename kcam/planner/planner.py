@@ -62,6 +62,13 @@ def make_plan(
                max_memory: bytes for the transforms; None for the camera's own.
     Raises:    ValueError for a tolerance or a memory out of range, or no scenes; TypeError for other things than
                scenes.
+
+    Example:
+    >>> from kcam.planner import make_plan
+    >>> near, far = (Scene.from_rgb(torch.rand(3, 24, 32), depth=depth) for depth in (0.5, 3.0))
+    >>> plan = make_plan(Camera.phone(), [near, far], tolerance=0.02)
+    >>> plan.bound <= 0.02, 1 / plan.range.nearest, round(1 / plan.range.farthest, 6)
+    (True, 0.5, 3.0)
     """
     check_tolerance(tolerance)
     return Planner(camera, scenes, max_memory=max_memory).plan(tolerance)
@@ -75,6 +82,12 @@ def shoot(
     picture, whose choices are tried out.
 
     Arguments and errors: as `make_plan`, and as `Camera`.
+
+    Example:
+    >>> from kcam.planner import shoot
+    >>> picture, plan = shoot(Camera.phone(), Scene.builtin("coffee", size=32), tolerance=0.02)
+    >>> picture.shape, plan.tolerance
+    (torch.Size([1, 3, 21, 32]), 0.02)
     """
     check_tolerance(tolerance)
     planner = Planner(camera, scene, one=True)
@@ -90,6 +103,12 @@ class Planner:
     """Plans for one camera and some scenes; what was tried for one tolerance is known for the next.
 
     Arguments and errors: as `make_plan`. one: for a single picture, so that only that is looked at which pays for it.
+
+    Example:
+    >>> from kcam.planner import Planner
+    >>> planner = Planner(Camera.phone(), Scene.builtin("coffee", size=32))
+    >>> [planner.plan(tolerance).bound <= tolerance for tolerance in (0.1, 0.01)]
+    [True, True]
     """
 
     @no_more_than_free()
@@ -211,13 +230,27 @@ def explain(
     """A plan for a scene; with `measure`, also its true error and times: the raw with and without it, by turns.
 
     Arguments and errors: as `make_plan`.
+
+    Example:
+    >>> from kcam.planner import explain
+    >>> plan = explain(Camera.phone(), Scene.builtin("coffee", size=32), tolerance=0.02, measure=True)
+    >>> plan.measured["error"] <= 0.02
+    True
     """
     plan = make_plan(camera, scene, tolerance=tolerance, max_memory=max_memory)
     return dataclasses.replace(plan, measured=measured(plan, camera, scene)) if measure else plan
 
 
 def measured(plan: Plan, camera: Camera, scene: Scene, *, rounds: int = 3) -> dict[str, float]:
-    """True error of a plan, and the median times of the raw with it and without, by turns [s]."""
+    """True error of a plan, and the median times of the raw with it and without, by turns [s].
+
+    Example:
+    >>> from kcam.planner import measured
+    >>> camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)
+    >>> found = measured(camera.plan(scene, tolerance=0.02), camera, scene, rounds=1)
+    >>> sorted(found), found["error"] <= 0.02
+    (['error', 'reference_seconds', 'seconds'], True)
+    """
     found: dict[str, list[float]] = {"seconds": [], "reference_seconds": []}
     error = plan.measure(camera, scene)
     with torch.no_grad():
@@ -233,7 +266,14 @@ def fresh(stage: Any) -> Any:
 
 
 def timed(camera: Camera, scene: Scene) -> tuple[float, torch.Tensor]:
-    """Seconds of the noiseless raw with new optics, of which nothing is kept, and the raw."""
+    """Seconds of the noiseless raw with new optics, of which nothing is kept, and the raw.
+
+    Example:
+    >>> from kcam.planner import timed
+    >>> seconds, raw = timed(Camera.phone(), Scene.builtin("coffee", size=32))
+    >>> seconds > 0, raw.shape
+    (True, torch.Size([1, 1, 21, 32]))
+    """
     raw = noiseless_raw(Camera(*(fresh(stage) for stage in camera), context=camera.context))
     start = time.perf_counter()
     result = raw(scene)

@@ -60,6 +60,12 @@ class SteerableFeatures(nn.Module):
     Source:    Field, Relations between the statistics of natural images and the response properties of cortical cells
                (1987), the log-Gabor filter; Portilla and Simoncelli, A parametric texture model based on joint
                statistics of complex wavelet coefficients (2000), which coefficients tell textures apart.
+
+    Example:
+    >>> from kcam.style import SteerableFeatures
+    >>> layers = SteerableFeatures()(torch.rand(1, 3, 64, 64))
+    >>> {name: tuple(layer.shape) for name, layer in layers.items() if "scale" in name}
+    {'scale 0': (1, 72, 64, 64), 'scale 1': (1, 72, 32, 32), 'scale 2': (1, 72, 16, 16), 'scale 3': (1, 54, 8, 8)}
     """
 
     name = "steerable"

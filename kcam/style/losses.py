@@ -210,6 +210,13 @@ class StyleLoss(nn.Module):
         crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
     Raises:    ValueError for an unknown name, weights that are negative or all 0, or a style that is too small;
                TypeError for what is no picture.
+
+    Example:
+    >>> from kcam.style import StyleLoss, painting
+    >>> loss, picture = StyleLoss(painting("woodcut", size=128)), torch.rand(1, 3, 64, 64)
+    >>> terms = loss.terms(picture, scene=picture)
+    >>> list(terms), bool(terms["content"] < 1e-3)  # a picture shows itself
+    (['style', 'colour', 'content'], True)
     """
 
     features: Any

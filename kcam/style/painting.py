@@ -50,6 +50,13 @@ def paint(
                what the features raise for a picture that is too small.
     Source:    Gatys, Ecker and Bethge, Image style transfer using convolutional neural networks (2016); the
                preconditioning after Olah, Mordvintsev and Schubert, Feature visualization (2017).
+
+    Example:
+    >>> from kcam.style import StyleLoss, paint, painting
+    >>> loss = StyleLoss(painting("woodcut", size=128), content=0.0)
+    >>> texture = paint(loss, shape=(64, 64), steps=2)
+    >>> texture.shape, bool((texture >= 0).all() and (texture <= 1).all())
+    (torch.Size([3, 64, 64]), True)
     """
     start = start or ("noise" if photo is None else "photo")
     if start not in STARTS or (start == "photo" and photo is None):

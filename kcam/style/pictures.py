@@ -68,6 +68,9 @@ def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> 
                seed: of all that is left to chance, 0 or more.
     Returns:   float32 (3, H, W), sRGB in [0, 1], in steps of 1/255: an 8-bit file holds the same picture.
     Raises:    ValueError for an unknown name, a size or a seed out of range.
+
+    Example:
+    >>> from kcam.style import painting
     >>> painting("mosaic", size=(64, 96)).shape
     torch.Size([3, 64, 96])
     """

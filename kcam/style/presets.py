@@ -27,6 +27,11 @@ def style_camera(*, stage: bool = True) -> Camera:
     What trains: the phase of a 64 x 64 DOE, the curves of the filter (at a Nikon 5100's, non-negative), a 3 x 3
     convolution behind the demosaic (at the identity), the gains and the colour matrix (at the as-shot ones), and with
     `stage` a `StyleStage` at the end. The PSF has 12 wavelengths for any number of bands, and 41 x 41 pixels.
+
+    Example:
+    >>> from kcam.style import style_camera
+    >>> [type(stage).__name__ for stage in style_camera()][-5:]
+    ['Convolution', 'WhiteBalance', 'ColourMatrix', 'ToneCurve', 'StyleStage']
     """
     curves = sensor.ColourFilter.nikon()
     context = Context(colour_filter=curves)
@@ -77,6 +82,12 @@ class Preset:
     """A way to train. note: for the help. camera: makes it. loss: arguments of `StyleLoss`. settings: of `fit`.
 
     epochs: where it is these that are given, not the steps.
+
+    Example:
+    >>> from kcam.style import PRESETS
+    >>> quick = PRESETS["quick"]
+    >>> quick.settings.size, quick.settings.batch
+    (128, 2)
     """
 
     note: str

@@ -40,11 +40,23 @@ CLIPPED, NEGATIVE, DEAD = 0.1, 0.3, 0.05
 
 
 class StyleWarning(UserWarning):
-    """A camera in training turns negative, clips, or sees nothing in a channel."""
+    """A camera in training turns negative, clips, or sees nothing in a channel.
+
+    Example:
+    >>> from kcam.style import StyleWarning
+    >>> issubclass(StyleWarning, UserWarning)
+    True
+    """
 
 
 class TrainingError(RuntimeError):
-    """Training cannot go on: at which step, by which term, on which scenes."""
+    """Training cannot go on: at which step, by which term, on which scenes.
+
+    Example:
+    >>> from kcam.style import TrainingError
+    >>> issubclass(TrainingError, RuntimeError)
+    True
+    """
 
 
 class _State(TypedDict):

@@ -39,7 +39,16 @@ KEPT = 2**30
 
 
 class Source(Protocol):
-    """Where training scenes come from: the same ones for the same seed, step and rows, in any order."""
+    """Where training scenes come from: the same ones for the same seed, step and rows, in any order.
+
+    Example:
+    >>> class Grays:  # scenes of one's own, for fit(source=Grays())
+    ...     def __len__(self): return 1
+    ...     def draw(self, rows, *, seed, step):
+    ...         return Scene.from_rgb(torch.full((len(rows), 3, 64, 64), 0.5), depth=2.0), ["gray"] * len(rows)
+    >>> Grays().draw([0, 1], seed=0, step=0)[0].shape
+    (2, 64, 64)
+    """
 
     def __len__(self) -> int:
         """How many scenes make an epoch."""
@@ -59,6 +68,12 @@ class BuiltinScenes:
     Args:      size: of the crops [pixels], at most 300.
                names: of the photographs; by default all.
     Raises:    ValueError for an unknown name, or a size that no photograph holds.
+
+    Example:
+    >>> from kcam.style import BuiltinScenes
+    >>> scene, origins = BuiltinScenes(64, names=["chelsea"]).draw([0, 1], seed=0, step=0)
+    >>> scene.shape, scene.depth, len(origins)
+    ((2, 64, 64), 2.0, 2)
     """
 
     def __init__(self, size: int, *, names: Sequence[str] = tuple(PHOTOGRAPHS)) -> None:
@@ -127,6 +142,13 @@ class PhotoScenes:
                why.  mark: of the photographs' names and contents; other photographs have another.
     Raises:    FileNotFoundError, NotADirectoryError for what is no folder; ValueError for one without photographs, or
                none as large as a crop.
+
+    Example:
+    >>> from kcam.style import PhotoScenes
+    >>> plots.write_picture(torch.rand(3, 80, 100), "photo.png")
+    >>> scenes = PhotoScenes(".", 64)
+    >>> len(scenes.photos), scenes.draw([0], seed=0, step=0)[0].shape
+    (1, (1, 64, 64))
     """
 
     def __init__(self, folder: str | os.PathLike[str], size: int) -> None:
@@ -249,6 +271,13 @@ class PatchScenes:
                size: side of the crop that is taken of each patch [pixels]; None: the whole patch.
     Raises:    FileNotFoundError, StoreError for what is no store; ValueError for an empty one, or a size that its
                patches do not have.
+
+    Example:
+    >>> from kcam.style import PatchScenes
+    >>> data.write_cube("cube.tif", data.Cube(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "reflectance"))
+    >>> done = data.extract(data.make_plan(".", data.Settings(size=64, stride=64)), "patches")
+    >>> PatchScenes("patches").draw([0, 1], seed=0, step=0)[0].shape
+    (2, 64, 64)
     """
 
     def __init__(self, patches: str | os.PathLike[str] | PatchDataset, *, size: int | None = None) -> None:

@@ -36,6 +36,12 @@ class Settings:
         correlation alone; that by features has another unit for each network.
     tolerance: None trains through the reference physics; else through a plan for the training scenes, which is frozen
         between checkpoints and made anew where it is measured to miss the tolerance: see `kcam.Plan`.
+
+    Example:
+    >>> from kcam.style import Settings
+    >>> settings = Settings(steps=100, rates={"optics": 0.02, "tone": 0.01})  # filter and demosaic do not train
+    >>> settings.steps, settings.rates["optics"]
+    (100, 0.02)
     """
 
     steps: int = 400

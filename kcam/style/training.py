@@ -20,7 +20,14 @@ from kcam.threads import fixed
 
 @dataclass(frozen=True)
 class Progress:
-    """What is known after a step: its number, the terms of its loss, and the seconds since the start."""
+    """What is known after a step: its number, the terms of its loss, and the seconds since the start.
+
+    Example:
+    >>> from kcam.style import Progress
+    >>> done = Progress(step=10, terms={"total": 1.5, "style": 1.2}, seconds=4.0)
+    >>> f"{done.step}: {done.terms['total']:.2f}"
+    '10: 1.50'
+    """
 
     step: int
     terms: dict[str, float]
@@ -34,6 +41,13 @@ class Trained:
     camera: with the averaged weights. history: (N, 1 + terms) float64, total and terms of each step. names: of its
     columns. profile: seconds by part of a step, over the `steps_timed` that this call took. advice: warnings that were
     given. plan: the last one, if any. finished: whether all steps were taken.
+
+    Example:
+    >>> from kcam.style import Settings, StyleLoss, fit, painting, style_camera
+    >>> loss = StyleLoss(painting("woodcut", size=128))
+    >>> trained = fit(style_camera(stage=False), loss, settings=Settings(steps=1, size=64, batch=1))
+    >>> trained.names, tuple(trained.history.shape), trained.finished
+    (('total', 'style', 'colour', 'content'), (1, 4), True)
     """
 
     camera: Camera
@@ -79,6 +93,13 @@ def fit(
     Returns:   the camera, with averaged weights, and its history.
     Raises:    ValueError for a camera in which nothing trains, or a checkpoint of another run; TrainingError where the
                loss is not finite or diverges again and again.
+
+    Example:
+    >>> from kcam.style import Settings, StyleLoss, fit, painting, style_camera
+    >>> camera = style_camera(stage=False)
+    >>> trained = fit(camera, StyleLoss(painting("woodcut", size=128)), settings=Settings(steps=1, size=64, batch=1))
+    >>> tuple(trained.history.shape), trained.finished
+    ((1, 4), True)
     """
     if not isinstance(camera, Camera) or not isinstance(loss, StyleLoss):
         raise TypeError(

@@ -52,6 +52,12 @@ class VGG16Features(nn.Module):
                pool or precision. From the call as `SteerableFeatures`.
     Source:    Simonyan and Zisserman, Very deep convolutional networks for large-scale image recognition (2015);
                Johnson, Alahi and Fei-Fei, Perceptual losses for real-time style transfer and super-resolution (2016).
+
+    Example:
+    >>> from kcam.style import VGG16Features
+    >>> VGG16Features("vgg16-397923af.pth")  # kcam downloads nothing
+    Traceback (most recent call last):
+    FileNotFoundError: there is no file vgg16-397923af.pth. The weights of VGG16 are torchvision's ...
     """
 
     multiple = 8

@@ -31,6 +31,12 @@ class Setting:
     """A camera and a scene in which one knob is turned.
 
     optics: whether the knob changes the PSFs. default: the camera as it was given. baseline: not kcam's own way.
+
+    Example:
+    >>> from kcam.tradeoff import settings
+    >>> given = settings(Camera.phone(), Scene.builtin("coffee", size=32), knobs=["wavelengths"])[0]
+    >>> given.name, given.default
+    ('nonparaxial radial', True)
     """
 
     knob: str
@@ -54,6 +60,11 @@ def settings(
     non-paraxial one, because beside a model's error no other would show.
 
     Raises:    ValueError for a camera without optics, or an unknown knob.
+
+    Example:
+    >>> from kcam.tradeoff import settings
+    >>> [s.name for s in settings(Camera.phone(), Scene.builtin("coffee", size=32), knobs=["wavelengths"])]
+    ['nonparaxial radial', '3 wavelengths', '7 wavelengths', '14 wavelengths']
     """
     unknown = set(knobs or ()) - set(KNOBS)
     if unknown:

@@ -52,6 +52,14 @@ def sweep(
                title: of the table and the figure.
     Raises:    ValueError for a camera without optics, a scene that is not on the CPU, or optics for which the reference
                is not converged.
+
+    Example:
+    >>> from kcam.tradeoff import sweep
+    >>> lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
+    >>> camera = Camera(optics.Imaging(lens, pixel_pitch=8 * um), sensor.ColourFilter.kodak())
+    >>> found = sweep(camera, Scene.builtin("coffee", size=8), knobs=["precision"], seconds=0.0)
+    >>> [(row.name, row.raw_rms < 1e-4) for row in found.rows]
+    [('nonparaxial radial', True), ('float64', True)]
     """
     if scene.device.type != "cpu":
         raise ValueError(f"the sweep measures the CPU, but the scene is on {scene.device}. Use scene.to('cpu').")
