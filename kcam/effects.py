@@ -16,6 +16,12 @@ class Work:
     """Counts of operations by their kind (see `kcam.planner.costs.RATES`), and memory at the peak [bytes].
 
     Two works one after the other add up their operations and need the larger memory.
+
+    Example:
+    >>> from kcam.effects import Work
+    >>> both = Work({"touch": 10.0}, memory=4e6) + Work({"touch": 5.0}, memory=1e6)
+    >>> both.operations, both.memory
+    ({'touch': 15.0}, 4000000.0)
     """
 
     operations: Mapping[str, float] = field(default_factory=dict)
@@ -33,6 +39,14 @@ class Skippable(Protocol):
 
     Left out means that the signal passes unchanged, or through the stage that its method ``bypass()`` gives. A stage
     with a parameter that requires grad is kept whatever it says.
+
+    Example:
+    >>> from kcam.effects import Skippable
+    >>> noise, signal = sensor.ReadNoise(3.0), torch.full((1, 1, 8, 8), 0.5)  # 5000 electrons
+    >>> isinstance(noise, Skippable), round(noise.error_if_skipped(signal, kcam.Context()), 5)
+    (True, 0.0006)
+    >>> noise.reason(signal, kcam.Context())
+    'sigma 3 of 5000 electrons'
     """
 
     def error_if_skipped(self, signal: Tensor, context: Context) -> float:

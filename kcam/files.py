@@ -98,6 +98,13 @@ def save(module: nn.Module, path: str | os.PathLike[str], *, classes: Mapping[st
                that is not among `kcam.layers.NAMES`, was changed after it was made, or is subclassed without a
                constructor of its own;
                FileNotFoundError if the folder does not exist.
+
+    Example:
+    >>> from kcam import files
+    >>> known = {"sensor.ReadNoise": sensor.ReadNoise}
+    >>> files.save(sensor.ReadNoise(3.0), "noise.safetensors", classes=known, version=kcam.__version__)
+    >>> files.load("noise.safetensors", classes=known).sigma_electrons
+    3.0
     """
     path = Path(path)
     if path.suffix != ".safetensors":
@@ -129,6 +136,14 @@ def load(path: str | os.PathLike[str], *, classes: Mapping[str, type]) -> Any:
                classes: name in the file -> class; nothing else is ever built.
     Raises:    FileNotFoundError; ValueError for a file that is damaged, from elsewhere, from a newer kcam, with a class
                that `classes` lacks, or with a tensor that is missing or has another shape.
+
+    Example:
+    >>> from kcam import files
+    >>> noise = sensor.ReadNoise(torch.nn.Parameter(torch.tensor(3.0)))
+    >>> files.save(noise, "noise.safetensors", classes={"noise": sensor.ReadNoise}, version=kcam.__version__)
+    >>> files.load("noise.safetensors", classes={"noise": sensor.ReadNoise}).sigma_electrons
+    Parameter containing:
+    tensor(3., requires_grad=True)
     """
     document, tensors = _read(Path(path))
     reader = _Reader(layers.LAYERS | dict(classes), tensors, path)
@@ -150,7 +165,14 @@ def load(path: str | os.PathLike[str], *, classes: Mapping[str, type]) -> Any:
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The configuration in a saved file, as plain values: what was saved, without building it. Raises: as `load`."""
+    """The configuration in a saved file, as plain values: what was saved, without building it. Raises: as `load`.
+
+    Example:
+    >>> from kcam import files
+    >>> Camera(sensor.ReadNoise(3.0), sensor.ADC(bits=10)).save("camera.safetensors")
+    >>> files.describe("camera.safetensors")["configuration"]["arguments"]["stages"][0]
+    {'class': 'sensor.ReadNoise', 'arguments': {'sigma_electrons': 3.0, 'full_well': None}}
+    """
     return _read(Path(path))[0]
 
 
@@ -312,6 +334,11 @@ def fitting_arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
     Only of kcam's classes and torch's, for others may say of their types what they like.
 
     Raises:    ValueError for an argument of another type, or that the constructor does not have.
+
+    Example:
+    >>> from kcam import files
+    >>> files.fitting_arguments(sensor.ADC, {"bits": 12, "black_level": 64})
+    {'bits': 12, 'black_level': 64}
     """
     if cls.__module__.partition(".")[0] not in ("kcam", "torch") or cls in (nn.Sequential, nn.Identity):
         return dict(values)
@@ -383,7 +410,15 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def check_place(path: Path) -> None:
-    """ValueError where no file of that name can be: where there is a folder, or none to put it into."""
+    """ValueError where no file of that name can be: where there is a folder, or none to put it into.
+
+    Example:
+    >>> import pathlib
+    >>> from kcam import files
+    >>> files.check_place(pathlib.Path("nowhere/picture.png"))
+    Traceback (most recent call last):
+    ValueError: cannot write picture.png: there is no folder nowhere.
+    """
     if path.is_dir():
         raise ValueError(f"cannot write {path.name}: there is a folder of that name. Choose another name.")
     if not path.absolute().parent.is_dir():
@@ -391,20 +426,45 @@ def check_place(path: Path) -> None:
 
 
 def check_other(path: str | os.PathLike[str], given: str | os.PathLike[str] | None) -> None:
-    """ValueError where a file that will be written is the one that is read."""
+    """ValueError where a file that will be written is the one that is read.
+
+    Example:
+    >>> from kcam import files
+    >>> plots.write_picture(torch.rand(3, 8, 8), "photo.png")
+    >>> files.check_other("photo.png", "photo.png")
+    Traceback (most recent call last):
+    ValueError: photo.png is what is read, and would be lost. Choose another name for --out.
+    """
     if given and Path(path).exists() and Path(given).exists() and Path(path).samefile(given):
         raise ValueError(f"{path} is what is read, and would be lost. Choose another name for --out.")
 
 
 def replace(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write beside the file, then take its place: a crash or a full disk leaves the old file whole."""
+    """Write beside the file, then take its place: a crash or a full disk leaves the old file whole.
+
+    Example:
+    >>> from pathlib import Path
+    >>> from kcam import files
+    >>> files.replace("notes.txt", b"the whole of it")
+    >>> Path("notes.txt").read_bytes()
+    b'the whole of it'
+    """
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Where to write a file that takes the place of `path` when all of it is on the disk, and not before."""
+    """Where to write a file that takes the place of `path` when all of it is on the disk, and not before.
+
+    Example:
+    >>> from pathlib import Path
+    >>> from kcam import files
+    >>> with files.replacing("notes.txt") as beside:
+    ...     written = beside.write_text("the whole of it")
+    >>> Path("notes.txt").read_text(), beside.exists()
+    ('the whole of it', False)
+    """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:

@@ -45,6 +45,12 @@ def illuminant(light: str | Tensor, *, wavelengths: Tensor) -> Tensor:
     Raises:    ValueError for an unknown name, or a power that is negative, not finite, all zero or of another length;
                TypeError for neither a name nor a tensor.
     Source:    CIE 15 tables in steps of 5 nm, linear between; constant beyond their ends, as in ASTM E308.
+
+    Example:
+    >>> wavelengths = kcam.units.wavelength_grid()
+    >>> red, blue = (spectral.illuminant("A", wavelengths=wavelengths)[band] for band in (-1, 0))
+    >>> round(float(red / blue))  # a filament is mostly red
+    10
     """
     grid = _grid(wavelengths)
     if isinstance(light, str):
@@ -60,7 +66,12 @@ def illuminant(light: str | Tensor, *, wavelengths: Tensor) -> Tensor:
 
 
 def illuminant_names() -> tuple[str, ...]:
-    """The lights that `illuminant` knows by name."""
+    """The lights that `illuminant` knows by name.
+
+    Example:
+    >>> "D65" in spectral.illuminant_names(), len(spectral.illuminant_names())
+    (True, 14)
+    """
     return tuple(_table("illuminants")["names"].tolist())
 
 
@@ -69,6 +80,11 @@ def observer(wavelengths: Tensor) -> Tensor:
 
     Args:      wavelengths: (L,) [m].
     Returns:   (L, 3) float64, linear between the table's steps of 1 nm, 0 outside 360..830 nm.
+
+    Example:
+    >>> wavelengths = torch.arange(500, 601).double() * nm
+    >>> round(float(wavelengths[spectral.observer(wavelengths)[:, 1].argmax()]) / nm)  # the eye sees green best
+    555
     """
     table = _table("observer")
     points = np.array(_grid(wavelengths))
@@ -83,6 +99,10 @@ def band_widths(wavelengths: Tensor) -> Tensor:
 
     Args:      wavelengths: (L,) [m], in any order.
     Returns:   (L,) float64 [m], in the same order; 10 nm for a single band.
+
+    Example:
+    >>> (spectral.band_widths(torch.tensor([500.0, 510.0, 530.0]) * nm) / nm).round().tolist()  # nm
+    [10.0, 15.0, 20.0]
     """
     grid = np.array(_grid(wavelengths)) * nm
     if len(grid) == 1:
@@ -108,6 +128,12 @@ def xyz_weights(wavelengths: Tensor, light: str | Tensor = "E") -> Tensor:
                delta-E2000 under D65 is 0.07 in the mean and 0.46 at most for the 28 default bands (they lack the ends
                of the spectrum), 0.01 and 0.03 for 400..700 nm in steps of 10 nm, 0.11 and 0.39 for 14 bands.
     Source:    Lagrange interpolation as in ASTM E2022, ends as in ASTM E308, but for bands at any distances.
+
+    Example:
+    >>> weights = spectral.xyz_weights(kcam.units.wavelength_grid(), "D65")
+    >>> x, y, z = weights.sum(0)  # XYZ of a perfect white
+    >>> round(float(x / (x + y + z)), 4), round(float(y / (x + y + z)), 4)  # D65: 0.3127, 0.3290
+    (0.3127, 0.329)
     """
     return torch.tensor(_colour_matching(_grid(wavelengths))) * illuminant(light, wavelengths=wavelengths)[:, None]
 
@@ -118,6 +144,12 @@ def spectrum_to_xyz(bands: Tensor, *, wavelengths: Tensor) -> Tensor:
     Args:      bands: (..., L, H, W) relative radiance.  wavelengths: (L,) [m].
     Returns:   (..., 3, H, W).
     Raises:    ValueError if L differs.
+
+    Example:
+    >>> wavelengths = kcam.units.wavelength_grid()
+    >>> white = spectral.illuminant("D65", wavelengths=wavelengths)[:, None, None]
+    >>> [round(float(value), 3) for value in spectral.spectrum_to_xyz(white, wavelengths=wavelengths).flatten()]
+    [0.95, 1.0, 1.089]
     """
     weights = xyz_weights(wavelengths).to(bands)
     if bands.ndim < 3 or bands.shape[-3] != len(weights):
@@ -140,12 +172,23 @@ def xyz_to_srgb_matrix() -> Tensor:
     """The matrix from XYZ to linear sRGB, (3, 3) float64: its primaries, and its white at exactly our D65.
 
     Rounded matrices (IEC 61966-2-1, Kornia) differ by up to 4e-4 and tint a perfect white; this one gives 1, 1, 1.
+
+    Example:
+    >>> white = spectral.xyz_weights(kcam.units.wavelength_grid(), "D65").sum(0)
+    >>> torch.allclose(spectral.xyz_to_srgb_matrix() @ white, torch.ones(3).double(), atol=1e-6)
+    True
     """
     return torch.tensor(_xyz_to_srgb())
 
 
 def xyz_to_linear_srgb(xyz: Tensor) -> Tensor:
-    """Linear sRGB from XYZ, (..., 3, H, W); not clipped, and not adapted to another white than D65."""
+    """Linear sRGB from XYZ, (..., 3, H, W); not clipped, and not adapted to another white than D65.
+
+    Example:
+    >>> xyz = torch.tensor([0.4124, 0.2126, 0.0193])[:, None, None]  # the red primary
+    >>> [round(float(value), 2) + 0.0 for value in spectral.xyz_to_linear_srgb(xyz).flatten()]
+    [1.0, 0.0, 0.0]
+    """
     return torch.einsum("rc,...chw->...rhw", xyz_to_srgb_matrix().to(xyz), xyz)
 
 
@@ -163,6 +206,11 @@ def rgb_basis(wavelengths: Tensor) -> Tensor:
     Valid when there is such a B: with 11 or more even bands over 420..720 nm, or uneven ones without gaps in which a
                primary would fall. `rgb_error` states what is lost elsewhere. Below 3 bands it is M itself.
     Source:    Mallett, Yuksel, Spectral Primary Decomposition for Rendering with sRGB Reflectance, EGSR 2019.
+
+    Example:
+    >>> basis = spectral.rgb_basis(kcam.units.wavelength_grid())
+    >>> torch.allclose(basis.sum(0), torch.ones(28).double()), bool((basis >= 0).all())  # white is 1 everywhere
+    (True, True)
     """
     return torch.tensor(_rgb_basis(_grid(wavelengths)))
 
@@ -172,6 +220,10 @@ def rgb_error(wavelengths: Tensor) -> float:
 
     Args:      wavelengths: (L,) [m].
     Returns:   of coded sRGB, 0..1: some 1e-14 where the bands carry the colours, 0.1 for 10 even bands, 0.4 for 6.
+
+    Example:
+    >>> [spectral.rgb_error(kcam.units.wavelength_grid(count=count)) > 0.01 for count in (28, 6)]
+    [False, True]
     """
     return _rgb_error(_grid(wavelengths))
 
@@ -180,6 +232,11 @@ def colour_chart() -> tuple[tuple[str, ...], Tensor, Tensor]:
     """The 24 patches of the ColorChecker as measured: names, wavelengths (36,) [m], reflectances (24, 36).
 
     Row by row, dark skin first. Source: BabelColor, average of 30 charts, through colour-science.
+
+    Example:
+    >>> names, wavelengths, values = spectral.colour_chart()
+    >>> len(names), names[0], tuple(values.shape)
+    (24, 'dark skin', (24, 36))
     """
     table = _table("colour_chart")
     return tuple(table["names"].tolist()), torch.tensor(table["wavelengths"]) * nm, torch.tensor(table["values"])
@@ -189,6 +246,11 @@ def reflectances(wavelengths: Tensor) -> Tensor:
     """The 24 patches' reflectances at the given wavelengths, (24, L) float64.
 
     Cubic between the measurements, which are 10 nm apart; constant beyond 380..730 nm.
+
+    Example:
+    >>> red = spectral.colour_chart()[0].index("red")
+    >>> [round(float(share), 2) for share in spectral.reflectances(torch.tensor([450.0, 650.0]) * nm)[red]]
+    [0.05, 0.68]
     """
     table = _table("colour_chart")
     return torch.tensor(table["values"] @ _interpolation(table["wavelengths"], np.array(_grid(wavelengths))))
@@ -204,6 +266,12 @@ def sensitivity(name: str, *, wavelengths: Tensor) -> Tensor:
     Returns:   (3, L) float64, green peaking at 1; linear between the steps of the table (5 or 10 nm), 0 outside it.
     Raises:    ValueError for an unknown name.
     Source:    Darrodi et al., Reference data set for camera spectral sensitivity estimation, JOSA A 32 (2015) 381.
+
+    Example:
+    >>> wavelengths = torch.arange(400, 701, 10).double() * nm
+    >>> curves = spectral.sensitivity("nikon_5100", wavelengths=wavelengths)
+    >>> (wavelengths[curves.argmax(1)] / nm).round().tolist()  # red, green, blue
+    [590.0, 530.0, 460.0]
     """
     if name not in SENSITIVITIES:
         raise ValueError(f"unknown sensitivity {name!r}. There are: {', '.join(SENSITIVITIES)}.")

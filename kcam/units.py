@@ -45,6 +45,14 @@ def wavelength_grid(wavelengths: Tensor | list[float] | None = None, *, count: i
     Args:      wavelengths: (L,) [m], in any order; None for the default grid.
     Returns:   (L,) float64 [m].
     Raises:    ValueError for an empty or nested list, or a value outside 1e-7..2e-5 m; TypeError for what is no number.
+
+    Example:
+    >>> from kcam.units import wavelength_grid
+    >>> wavelength_grid().shape
+    torch.Size([28])
+    >>> wavelength_grid([550])
+    Traceback (most recent call last):
+    ValueError: wavelength 550 is outside 1e-07..2e-05 m. Wavelengths are in metres; did you mean 550 * nm?
     """
     if wavelengths is None:
         return torch.linspace(420, 720, count, dtype=torch.float64) * nm
@@ -66,7 +74,13 @@ def wavelength_grid(wavelengths: Tensor | list[float] | None = None, *, count: i
 
 
 def as_numbers(value: Any, *, name: str, expected: str) -> Tensor:
-    """A number, a list or a tensor as float64; TypeError that says what was expected for anything else."""
+    """A number, a list or a tensor as float64; TypeError that says what was expected for anything else.
+
+    Example:
+    >>> from kcam.units import as_numbers
+    >>> as_numbers([1, 2.5], name="distances", expected="numbers of metres")
+    tensor([1.0000, 2.5000], dtype=torch.float64)
+    """
     try:
         return torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -80,7 +94,16 @@ def _perhaps(value: float, unit: str, *, example: str) -> str:
 
 
 def check_length(value: Tensor | float, *, name: str, within: tuple[float, float], example: str) -> float:
-    """A length in metres; ValueError that names the likely mistake outside a range, TypeError for what is no number."""
+    """A length in metres; ValueError that names the likely mistake outside a range, TypeError for what is no number.
+
+    Example:
+    >>> from kcam.units import check_length
+    >>> check_length(4 * um, name="pixel_pitch", within=(1e-7, 1e-3), example="4 * um")
+    4e-06
+    >>> check_length(4, name="pixel_pitch", within=(1e-7, 1e-3), example="4 * um")
+    Traceback (most recent call last):
+    ValueError: pixel_pitch 4 is outside 1e-07..0.001 m. Lengths are in metres; did you mean 4 * um?
+    """
     expected = f"a number of metres such as {example}"
     number = as_numbers(value, name=name, expected=expected).detach()
     if number.numel() != 1:
@@ -95,7 +118,14 @@ def check_length(value: Tensor | float, *, name: str, within: tuple[float, float
 
 
 def check_pixel_pitch(pitch: float) -> float:
-    """A pixel pitch in metres, 0.1 um to 1 mm; errors as `check_length`."""
+    """A pixel pitch in metres, 0.1 um to 1 mm; errors as `check_length`.
+
+    Example:
+    >>> from kcam.units import check_pixel_pitch
+    >>> check_pixel_pitch(4)
+    Traceback (most recent call last):
+    ValueError: pixel_pitch 4 is outside 1e-07..0.001 m. Lengths are in metres; did you mean 4 * um?
+    """
     return check_length(pitch, name="pixel_pitch", within=PIXEL_PITCH_RANGE, example="4 * um")
 
 
@@ -103,6 +133,14 @@ def check_distances(distance: Tensor | float, *, name: str = "distance") -> Tens
     """Object distances in metres as float64, each > 0 or inf.
 
     Raises:    ValueError for zero, negative, NaN, or nearer than 1e-7 m; TypeError for what is no number.
+
+    Example:
+    >>> from kcam.units import check_distances
+    >>> check_distances([0.5, float("inf")])
+    tensor([0.5000,    inf], dtype=torch.float64)
+    >>> check_distances(0.0)
+    Traceback (most recent call last):
+    ValueError: distance 0 is not a distance in front of the lens: expected metres > 0, ...
     """
     values = as_numbers(distance, name=name, expected="a number of metres such as 2.0")
     bad = ~(values > 0)
@@ -121,7 +159,16 @@ def check_distances(distance: Tensor | float, *, name: str = "distance") -> Tens
 
 
 def warn_of_millimetres(depth: Tensor | float) -> None:
-    """UserWarning where the nearest finite depth is 300 m or more: it was probably meant in millimetres."""
+    """UserWarning where the nearest finite depth is 300 m or more: it was probably meant in millimetres.
+
+    Example:
+    >>> import warnings
+    >>> from kcam.units import warn_of_millimetres
+    >>> with warnings.catch_warnings(record=True, action="always") as said:
+    ...     warn_of_millimetres(2000.0)
+    >>> print(said[0].message)
+    depth 2000 m: depths are in metres; did you mean 2000 * mm? ...
+    """
     values = torch.as_tensor(depth).detach()
     nearest = float(torch.where(values.isfinite(), values, math.inf).amin()) if values.numel() else math.inf
     if FAR <= nearest < math.inf:
@@ -133,7 +180,14 @@ def warn_of_millimetres(depth: Tensor | float) -> None:
 
 
 def check_trained(value: Tensor, *, name: str) -> None:
-    """ValueError where an optimiser's step or a loaded file brought NaN or infinity in."""
+    """ValueError where an optimiser's step or a loaded file brought NaN or infinity in.
+
+    Example:
+    >>> from kcam.units import check_trained
+    >>> check_trained(torch.tensor([1.0, math.nan]), name="phase")
+    Traceback (most recent call last):
+    ValueError: phase has 1 values that are NaN or infinite; ...
+    """
     value = value.detach()
     if bool(value.sum().isfinite()):  # at every use of a lens: one pass, without a copy
         return
@@ -146,7 +200,14 @@ def check_trained(value: Tensor, *, name: str) -> None:
 
 
 def check_positive(value: Tensor | float, *, name: str, unit: str = "m") -> None:
-    """ValueError unless every element of `value` is finite and > 0; TypeError for what is no number."""
+    """ValueError unless every element of `value` is finite and > 0; TypeError for what is no number.
+
+    Example:
+    >>> from kcam.units import check_positive
+    >>> check_positive(-1.0, name="sensor_distance")
+    Traceback (most recent call last):
+    ValueError: sensor_distance must be finite and > 0 m, got -1.
+    """
     number = float(as_numbers(value, name=name, expected=f"a number > 0 {unit}").detach().min())
     if not (number > 0 and math.isfinite(number)):
         raise ValueError(f"{name} must be finite and > 0 {unit}, got {number:g}.")
