@@ -52,6 +52,13 @@ class Camera(nn.Module):
                context: what holds where no stage and no scene says otherwise; by default `Context()`.
     Raises:    TypeError for a stage that is no module; ValueError if two stages contradict each other, or stand in an
                order that cannot work.
+
+    Example:
+    >>> camera = Camera(sensor.ColourFilter.kodak(), sensor.Mosaic("GBRG"), sensor.Exposure(), isp.Demosaic(),
+    ...                 isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve())
+    >>> white = camera(Scene.from_rgb(torch.ones(3, 8, 8), depth=2.0))
+    >>> white.shape, bool((white - 1).abs().max() < 0.01)
+    (torch.Size([1, 3, 8, 8]), True)
     """
 
     def __init__(self, *stages: nn.Module, context: Context | None = None) -> None:

@@ -57,6 +57,11 @@ class Context:
         colour_filter: the filter whose curves white balance, exposure and colour matrix use.
         pattern: name of the mosaic.
         full_well [electrons], gain (analogue, 1 at base ISO), white_share (of full scale), black_level (of full scale).
+
+    Example:
+    >>> context = kcam.Context()
+    >>> len(context.wavelengths), context.pattern, context.full_well
+    (28, 'RGGB', 10000.0)
     """
 
     wavelengths: Tensor = field(default_factory=wavelength_grid)
@@ -105,7 +110,15 @@ def applied(stage: nn.Module, signal: Any, context: Context, **others: Any) -> A
 
 
 class Stage(nn.Module):
-    """A module from tensor to tensor that may read a `Context`: ``stage(signal)`` or ``stage(signal, context)``."""
+    """A module from tensor to tensor that may read a `Context`: ``stage(signal)`` or ``stage(signal, context)``.
+
+    Example:
+    >>> class Halve(kcam.Stage):
+    ...     def forward(self, signal, context=None):
+    ...         return signal / 2
+    >>> (255 * Camera(Halve(), sensor.ADC(bits=8))(torch.ones(1, 1, 2, 2))).round().unique().tolist()  # DN
+    [128.0]
+    """
 
     def extra_repr(self) -> str:
         """The arguments."""

@@ -50,6 +50,14 @@ class Scene:
                illuminant: a name or (L,), see `spectral.illuminant`; kept as (L,) float64 on the CPU.
                luminance: of a perfect white [cd/m^2].
     Raises:    TypeError, ValueError for shapes that do not fit, integers, NaN or inf, negative radiance, depth <= 0.
+
+    Example:
+    >>> wall = Scene.from_rgb(torch.full((3, 4, 6), 0.5), depth=2.0)  # sRGB 0.5 is 0.214 of white
+    >>> wall.shape, len(wall.wavelengths), wall.depth
+    ((1, 4, 6), 28, 2.0)
+    >>> x, y, z = spectral.spectrum_to_xyz(wall.bands(), wavelengths=wall.wavelengths)[0, :, 0, 0]
+    >>> round(float(y), 3)
+    0.214
     """
 
     coefficients: Tensor

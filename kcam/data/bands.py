@@ -52,6 +52,10 @@ def parse_bands(text: str) -> np.ndarray:
     """Wavelengths (L,) [m] from "420:720:28", start:stop:count in nm.
 
     Raises:    ValueError for anything else.
+
+    Example:
+    >>> [round(1e9 * float(wavelength)) for wavelength in data.parse_bands("420:720:4")]  # nm
+    [420, 520, 620, 720]
     """
     complaint = f"bands {text!r} is not start:stop:count in nm, such as 420:720:28."
     try:
@@ -88,6 +92,13 @@ def resampling(source: np.ndarray, target: np.ndarray, *, method: str = "pchip",
         extrapolated.
     Error      of 31 bands (400 to 700 nm) onto 28 (420 to 700 nm), RMS over the 24 patches of the colour chart: see
         tests/data/test_bands.py.
+
+    Example:
+    >>> import numpy
+    >>> source, target = numpy.linspace(400e-9, 700e-9, 31), numpy.linspace(420e-9, 700e-9, 15)
+    >>> spectra = data.resampling(source, target).apply(numpy.ones((31, 2)))
+    >>> spectra.shape, bool(numpy.allclose(spectra, 1.0, atol=1e-6))  # even stays even
+    ((15, 2), True)
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; known: {', '.join(METHODS)}.")

@@ -36,7 +36,15 @@ _SLACK = 2**26  # bytes that a header may promise in any case
 
 
 class CubeError(ValueError):
-    """A cube that cannot be read or is not what it says; one line."""
+    """A cube that cannot be read or is not what it says; one line.
+
+    Example:
+    >>> import pathlib
+    >>> written = pathlib.Path("notes.tif").write_text("no picture")
+    >>> data.read_cube("notes.tif")
+    Traceback (most recent call last):
+    kcam.data.cube.CubeError: notes.tif: its format is not recognised. ...
+    """
 
 
 NOTHING_VALID = "it holds no valid pixel: all are NaN, infinite or marked as invalid."
@@ -83,6 +91,11 @@ class Cube:
         whole bands that were extrapolated. None: all were measured.
     depth: (H,W) float32 [m], or None.
     name: of the scene. source: what is known of where it comes from (format, scaling, group, licence, citation).
+
+    Example:
+    >>> cube = data.Cube(torch.rand(8, 4, 6), torch.linspace(420, 700, 8) * nm, "reflectance", name="wall")
+    >>> cube.values.shape, cube.unit
+    (torch.Size([8, 4, 6]), 'reflectance')
     """
 
     values: Tensor
@@ -190,6 +203,12 @@ def write_cube(path: str | os.PathLike[str], cube: Cube) -> None:
     """Write a cube as TIFF: see the head of this file. An old file of that name stays until the new one is whole.
 
     Raises:    CubeError for a name that does not end in .tif; FileNotFoundError if the folder does not exist.
+
+    Example:
+    >>> cube = data.Cube(torch.rand(8, 4, 6), torch.linspace(420, 700, 8) * nm, "reflectance")
+    >>> data.write_cube("wall.tif", cube)
+    >>> (data.read_cube("wall.tif").wavelengths / nm).round().tolist()
+    [420.0, 460.0, 500.0, 540.0, 580.0, 620.0, 660.0, 700.0]
     """
     pixels: np.ndarray | None = None
     bands: np.ndarray = np.zeros(cube.shape[0], bool)

@@ -22,7 +22,14 @@ MOST_OPEN = 256
 
 
 class Patch(NamedTuple):
-    """values: (L,H,W) float32. wavelengths: (L,) float64 [m]. scene: its name."""
+    """values: (L,H,W) float32. wavelengths: (L,) float64 [m]. scene: its name.
+
+    Example:
+    >>> patch = data.Patch(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "wall")
+    >>> values, wavelengths, scene = patch
+    >>> values.shape, scene
+    (torch.Size([8, 64, 64]), 'wall')
+    """
 
     values: Tensor
     wavelengths: Tensor
@@ -38,6 +45,13 @@ class PatchDataset(Dataset[Patch]):
     Args:      folder: a split, such as "patches/train".
     Raises:    FileNotFoundError; StoreError for a damaged manifest, and at access for a file that is cut off; at access
                TypeError for an index that is no whole number, IndexError for one beyond the last.
+
+    Example:
+    >>> data.write_cube("wall.tif", data.Cube(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "reflectance"))
+    >>> done = data.extract(data.make_plan(".", data.Settings(size=32, stride=32, split=(("train", 1.0),))), "patches")
+    >>> patches = data.PatchDataset("patches/train")
+    >>> len(patches), patches[0].values.shape, patches[0].scene
+    (4, torch.Size([8, 32, 32]), 'wall')
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:

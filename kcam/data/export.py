@@ -36,6 +36,12 @@ def export_patches(
     Args:      folder: a split, such as "patches/train". advance: told of each scene that is done, and their number.
     Returns:   the number of patches.
     Raises:    FileNotFoundError; StoreError for a damaged store, another suffix, or a path that exists; ImportError.
+
+    Example:
+    >>> data.write_cube("wall.tif", data.Cube(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "reflectance"))
+    >>> done = data.extract(data.make_plan(".", data.Settings(size=32, stride=32, split=(("train", 1.0),))), "patches")
+    >>> data.export_patches("patches/train", "train.h5")
+    4
     """
     folder, path = Path(folder), Path(path)
     if path.suffix not in WRITERS:

@@ -38,6 +38,12 @@ _SHOWN = 3  # names in an error
 class Photo(NamedTuple):
     """image: (3,H,W) float32 sRGB in [0,1]. depth: (1,H,W) float32 [m], > 0 everywhere. mask: (1,H,W) bool, where it
     was measured. name: of the file, as seen from the folder.
+
+    Example:
+    >>> depth = torch.full((1, 4, 6), 2.0)
+    >>> photo = data.Photo(torch.rand(3, 4, 6), depth, mask=depth.isfinite(), name="wall.png")
+    >>> Scene.from_rgb(photo.image, depth=photo.depth).shape
+    (1, 4, 6)
     """
 
     image: Tensor
@@ -72,6 +78,12 @@ class PhotoDataset(Dataset[Photo]):
                them; ValueError for a folder without pictures, two maps for one picture, or arguments out of range.
                At access: ValueError with the file for one that is damaged, a map of other proportions or without any
                distance, or a picture smaller than the window; IndexError, TypeError for an index that is none.
+
+    Example:
+    >>> plots.write_picture(torch.rand(3, 40, 60), "wall.png")
+    >>> photos = data.PhotoDataset(".", depth=2.0, size=30)
+    >>> len(photos), photos[0].image.shape, float(photos[0].depth.mean())
+    (1, torch.Size([3, 20, 30]), 2.0)
     """
 
     def __init__(
@@ -222,6 +234,13 @@ def read_depth(path: str | os.PathLike[str], *, scale: float = MILLIMETRES) -> T
     Args:      scale: metres per count; floats are taken as they are.
     Raises:    FileNotFoundError; ValueError with the file's name for one that is damaged, in colours, of other than
                one plane, or of 8 bits, in which no scene fits; ImportError for an EXR whose reader is not installed.
+
+    Example:
+    >>> import numpy
+    >>> numpy.save("depth.npy", numpy.array([[500, 0], [2000, 65535]], dtype=numpy.uint16))  # millimetres
+    >>> data.read_depth("depth.npy")[0]
+    tensor([[0.5000,    nan],
+            [2.0000,    nan]])
     """
     path = Path(path)
     check_scale(scale)

@@ -23,7 +23,15 @@ VERSION = 1
 
 
 class StoreError(ValueError):
-    """A patch store that cannot be made, continued or read; one line."""
+    """A patch store that cannot be made, continued or read; one line.
+
+    Example:
+    >>> import pathlib
+    >>> pathlib.Path("cubes").mkdir()
+    >>> data.make_plan("cubes", data.Settings())
+    Traceback (most recent call last):
+    kcam.data.patches.plan.StoreError: there are no cubes (.tif) in cubes. ...
+    """
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,11 @@ class Settings:
     min_mean: least mean of a patch, relative to the scene's brightest value. min_contrast: least standard deviation of
         the mean over the bands, relative to its mean. max_clipped: largest share of pixels with a band at the scene's
         brightest value. max_invalid: largest share of invalid pixels, which become 0.
+
+    Example:
+    >>> settings = data.Settings(size=64, stride=32, split=(("train", 0.8), ("test", 0.2)))
+    >>> settings.size, dict(settings.split)
+    (64, {'train': 0.8, 'test': 0.2})
     """
 
     size: int = 256
@@ -160,6 +173,12 @@ def make_plan(
     Args:      cubes: or one file.  readers: of other files there.
                told: what the readers were told, which decides the bytes as much as a file does.
     Raises:    StoreError where there is no cube to read.
+
+    Example:
+    >>> data.write_cube("wall.tif", data.Cube(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "reflectance"))
+    >>> plan = data.make_plan(".", data.Settings(size=32, stride=32))
+    >>> [(scene.name, scene.split, scene.shape) for scene in plan.scenes]
+    [('wall', 'train', (8, 64, 64))]
     """
     cubes = Path(cubes)
     opened: Readers = {SUFFIX: open_cube, **(readers or {})}

@@ -65,6 +65,13 @@ def extract(
                shard then completes the manifests. advance: told of each scene that is done, and its bytes.
                submit: of an executor with futures of its own, such as that of a `dask.distributed.Client`.
     Raises:    StoreError for a folder that holds something else, a store of another plan, or too small a disk.
+
+    Example:
+    >>> data.write_cube("wall.tif", data.Cube(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "reflectance"))
+    >>> plan = data.make_plan(".", data.Settings(size=32, stride=32, split=(("train", 1.0),)))
+    >>> done = data.extract(plan, "patches")
+    >>> done.done, done.patches, done.failed
+    (['wall'], 4, {})
     """
     out = Path(out)
     outcome = Outcome(failed=dict(plan.failed))

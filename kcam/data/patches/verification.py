@@ -18,6 +18,12 @@ def verify(store: str | os.PathLike[str], *, advance: Callable[[str, int], None]
     plan, every group of scenes in the split that its name's hash says and in no other.
 
     Args:      advance: told of each scene that was read, and how many there are.
+
+    Example:
+    >>> data.write_cube("wall.tif", data.Cube(torch.rand(8, 64, 64), torch.linspace(420, 700, 8) * nm, "reflectance"))
+    >>> done = data.extract(data.make_plan(".", data.Settings(size=32, stride=32)), "patches")
+    >>> data.verify("patches")  # nothing is wrong
+    []
     """
     store = Path(store)
     one = (store / MANIFEST).is_file()

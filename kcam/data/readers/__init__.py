@@ -74,6 +74,12 @@ def read_cube(
     Raises:    FileNotFoundError; CubeError with its name for a file that is damaged, of another layout, or without
                wavelengths; ValueError for an unknown format or other axes; ImportError for a format whose reader is
                not installed.
+
+    Example:
+    >>> cube = data.Cube(torch.rand(8, 4, 6), torch.linspace(420, 700, 8) * nm, "reflectance")
+    >>> data.write_cube("wall.tif", cube)
+    >>> torch.equal(data.read_cube("wall.tif").values, cube.values)
+    True
     """
     grids = [None if grid is None else wavelength_grid(grid).numpy() for grid in (wavelengths, bands)]
     try:
