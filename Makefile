@@ -1,4 +1,4 @@
-# make demo | demo-data | test | test-all | bench | bench-peers | bench-augmentation | bench-planner | bench-field | bench-style | bench-styles | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
+# make demo | demo-data | docs | docs-all | test | test-all | bench | bench-peers | bench-augmentation | bench-planner | bench-field | bench-style | bench-styles | bench-data | check | wheel-test | clean.   All is installed into .venv, once.
 PYTHON ?= python3
 VENV ?= .venv
 PEERS ?= .venv-peers
@@ -11,7 +11,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-data test test-slow test-all bench bench-peers bench-augmentation bench-planner bench-field bench-style bench-styles bench-data lint types check wheel-test clean
+.PHONY: help demo demo-data docs docs-all test test-slow test-all bench bench-peers bench-augmentation bench-planner bench-field bench-style bench-styles bench-data lint types check wheel-test clean
 
 help:
 	@head -1 Makefile
@@ -27,6 +27,10 @@ $(VENV)/dev.stamp: $(VENV)/core.stamp
 	$(PIP) --editable '.[dev]'
 	@touch $@
 
+$(VENV)/docs.stamp: $(VENV)/dev.stamp
+	$(PIP) --editable '.[docs]'
+	@touch $@
+
 demo: $(VENV)/core.stamp
 	$(BIN)/kcam demo --out demo/
 
@@ -38,6 +42,15 @@ demo-data: $(VENV)/dev.stamp
 	$(BIN)/python data_tools/extract_patches.py demo-data/cubes --size 128 --stride 64 --out demo-data/patches \
 	    --split 0.7/0.3 --workers 2
 	$(BIN)/python data_tools/verify_patches.py demo-data/patches
+
+# The site, into docs/_build/html: a warning is an error. docs-all runs the scripts that take minutes, too.
+SPHINX := $(BIN)/python -m sphinx -b html -W --keep-going docs docs/_build/html
+
+docs: $(VENV)/docs.stamp
+	MPLBACKEND=Agg $(SPHINX)
+
+docs-all: $(VENV)/docs.stamp
+	KCAM_DOCS_ALL=1 MPLBACKEND=Agg $(SPHINX)
 
 test: $(VENV)/dev.stamp
 	$(PYTEST) -m "not slow"
@@ -112,4 +125,4 @@ wheel-test: $(VENV)/core.stamp
 	rm -rf .wheel-test
 
 clean:
-	rm -rf $(VENV) $(PEERS) .wheel-test build dist demo demo-data
+	rm -rf $(VENV) $(PEERS) .wheel-test build dist demo demo-data docs/_build docs/learn docs/gallery docs/reference/api

@@ -1,12 +1,12 @@
-"""What the README shows and nobody should type: its tables, what its code prints, and its pictures.
+"""What the README and the pages of the site show and nobody should type: tables, what code prints, and pictures.
 
     python docs/generate.py               writes the tables, and what the code blocks print
-    python docs/generate.py --pictures    renders the pictures too: a quarter of an hour, most of it docs/lenses.jpg
+    python docs/generate.py --pictures    renders the pictures too: a quarter of an hour, most of it images/lenses.jpg
     python docs/generate.py --traps       runs the traps of tests/stability first: ten seconds
     python docs/generate.py --check       changes nothing; says what is out of step
 
 A table stands between ``<!-- generated: name -->`` and ``<!-- end -->``; what a ```python block prints stands in the
-```text block that follows it. `tests/test_readme.py` fails where the README and this script disagree.
+```text block that follows it. `tests/test_pages.py` fails where a page and this script disagree.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from PIL import Image  # noqa: E402
 
 import kcam.augmentation as KC  # noqa: E402
 from benchmarks.common import save_jpeg  # noqa: E402
-from kcam import Camera, Plan, Scene, demo, optics, plots  # noqa: E402
+from kcam import Camera, Plan, Scene, demo, isp, optics, plots, sensor  # noqa: E402
 from kcam.data import FORMATS  # noqa: E402
 from kcam.optics.propagation.question import Query  # noqa: E402
 from kcam.optics.propagation.table import choose  # noqa: E402
@@ -46,9 +46,19 @@ from kcam.tradeoff import Row, Sweep  # noqa: E402
 from kcam.units import mm, nm, um  # noqa: E402
 
 README = ROOT / "README.md"
-PAGES = ("docs/style.md",)
-"""Beside the README: their tables are made anew, their code is not run."""
+IMAGES = ROOT / "docs" / "images"
 RESULTS = ROOT / "benchmarks" / "results"
+
+
+def pages() -> list[Path]:
+    """The README and what is written by hand for the site."""
+    folders = ("start", "do", "understand", "reference")
+    return [README, ROOT / "docs" / "index.md", *(p for f in folders for p in sorted((ROOT / "docs" / f).glob("*.md")))]
+
+
+def results_link(path: Path) -> str:
+    """A link from a page of the site to a file of results."""
+    return f"[`{path.name}`](../../{path.relative_to(ROOT)})"
 
 # ---- the propagators -------------------------------------------------------------------------------------------------
 
@@ -201,7 +211,7 @@ def tradeoff_table() -> str:
 
 
 def tradeoff_picture(path: Path) -> None:
-    """The figure of a committed sweep: docs/tradeoff-NAME.png."""
+    """The figure of a committed sweep: tradeoff-NAME.png."""
     source = SWEEPS[path.stem.removeprefix("tradeoff-")]
     save_plot(plots.tradeoff_figure(Sweep.load(source)), path, source=source)
 
@@ -283,7 +293,7 @@ def field_table() -> str:
     environment = content["environment"]
     lines += [
         "",
-        f"<sub>[`{FIELD.name}`]({FIELD.relative_to(ROOT)}): {environment['machine']}, {environment['threads']} thread, "
+        f"<sub>{results_link(FIELD)}: {environment['machine']}, {environment['threads']} thread, "
         f"torch {environment['versions']['torch']}, {environment['date'][:10]}; CPU seconds of one thread, once each. "
         "Memory is the peak beyond what was in use before.</sub>",
     ]
@@ -354,6 +364,34 @@ PLAN_TITLES = {
     "wall": "**A flat wall at 5 m**, the distance of focus:",
     "night": "**A street at night**, houses from 2.5 m and lamps far away, through the same camera:",
 }
+
+
+def promise_tolerance() -> str:
+    """The README's sentence of what plans keep and gain."""
+    content = json.loads(HONESTY.read_text())
+    kinds = ("random", "hard", "adversarial")
+    rows = [row for kind in kinds for row in content[kind]["summary"]]
+    inside, plans = (sum(row[name] for row in rows) for name in ("inside", "pairs"))
+    counts = ", ".join(f"{content[kind]['summary'][0]['pairs']} {kind}" for kind in kinds)
+    gains = [figures(row["speed_up"]) for row in content["random"]["summary"]]
+    low, high = (content["random"]["summary"][index]["tolerance"] for index in (-1, 0))
+    return (
+        f"Of pairs of camera and scene, {counts}, at five tolerances from {high:g} to {low:g}, **{inside} of {plans}** "
+        f"stayed inside; over the random ones a picture is {', '.join(gains)} times as fast in the median."
+    )
+
+
+def promise_effects() -> str:
+    """The README's sentence of what a wall needs and what a street."""
+    wall, night = (Plan.load(PLANS / f"{name}.json") for name in ("wall", "night"))
+    chosen = {row.effect: row.chosen for row in night.decisions}
+    gains = [plan.measured["reference_seconds"] / plan.measured["seconds"] for plan in (wall, night)]
+    return (
+        f"At a tolerance of {wall.tolerance:g} a flat wall in focus needs no diffraction, and its raw takes "
+        f"**{figures(gains[0])} times** less time, with an error of {scientific(wall.measured['error'])}; a street at "
+        f"night needs {chosen['wavelengths']}, {chosen['depth']} and what hides what: {figures(gains[1])} times, with "
+        f"{scientific(night.measured['error'])}."
+    )
 
 
 def honesty_table() -> str:
@@ -493,7 +531,7 @@ def augmentation_speed_table() -> str:
     environment = content["environment"]
     lines += [
         "",
-        f"<sub>[`{AUGMENTED.name}`]({AUGMENTED.relative_to(ROOT)}): {environment['machine']}, {environment['threads']} "
+        f"<sub>{results_link(AUGMENTED)}: {environment['machine']}, {environment['threads']} "
         f"thread, torch {environment['versions']['torch']}, {environment['date'][:10]}; CPU milliseconds of a forward "
         f"pass at p = 1, medians of turns in one process. Bold is faster than ours. Kornia: the fastest of its nearest "
         f"({', '.join(f'`{who}`' for who in relatives)}). Plain: a loop over samples (noise: the whole batch at "
@@ -542,7 +580,7 @@ def segmentation_table() -> str:
     seconds = sum(row["seconds"] for row in content["regimes"])
     lines += [
         "",
-        f"<sub>[`{SEGMENTED.name}`]({SEGMENTED.relative_to(ROOT)}): intersection over union, mean ± standard deviation "
+        f"<sub>{results_link(SEGMENTED)}: intersection over union, mean ± standard deviation "
         f"of {content['seeds']} seeds, {content['steps']} steps each, {content['test_pictures']} test pictures; "
         f"{figures(seconds)} CPU seconds in all.</sub>",
     ]
@@ -585,7 +623,7 @@ def benchmark_part(content: dict[str, Any], path: Path) -> str:
     environment = content["environment"]
     lines += [
         "",
-        f"<sub>[`{path.name}`]({path.relative_to(ROOT)}): {environment['machine']}, {environment['threads']} thread, "
+        f"<sub>{results_link(path)}: {environment['machine']}, {environment['threads']} thread, "
         f"torch {environment['versions']['torch']}, {environment['date'][:10]}; {environment['clock']}. A time after ~ "
         "was measured on a sample of the wavelengths and scaled up, and its memory is the sample's. Memory is the "
         "peak beyond what was in use before.</sub>",
@@ -665,7 +703,7 @@ def throughput_table() -> str:
         f"Extraction with one worker wrote {figures(made['MB_per_second'])} MB of patches per second; copying the same "
         f"files, and syncing them as extraction does, {figures(copied['MB_per_second'])} MB/s: {share:.0%} of it.",
         "",
-        f"<sub>[`{PATCHES.name}`]({PATCHES.relative_to(ROOT)}): {content['patches']} patches of {shape}, "
+        f"<sub>{results_link(PATCHES)}: {content['patches']} patches of {shape}, "
         f"{environment['machine']}, one process, {environment['date'][:10]}; {environment['clock']}, medians of "
         f"{made['rounds']} to {rows['kcam store', 'warm']['rounds']} rounds by turns. Cold: dropped from the page "
         "cache, not from the disk's own.</sub>",
@@ -729,6 +767,65 @@ def style_table(which: str, **columns: str) -> str:
     return "\n".join((head, "|---" * (len(columns) + len(STYLE_MEASURES) + 2) + "|", *runs))
 
 
+# ---- the reference ---------------------------------------------------------------------------------------------------
+
+
+FRAUNHOFER = torch.tensor([486.13, 587.56, 656.27], dtype=torch.float64) * nm
+
+
+def glasses_table() -> str:
+    """`optics.GLASSES`: the index at the d line, the Abbe number, the range and where they are from."""
+    lines = ["| glass | n_d | v_d | from, to [um] | source |", "|---|---:|---:|---|---|"]
+    for name, glass in optics.GLASSES.items():
+        low, high = glass.valid
+        known = [low * um <= line <= high * um for line in FRAUNHOFER.tolist()]
+        index = [optics.refractive_index(name, wavelengths=FRAUNHOFER[i : i + 1]).item() if k else None
+                 for i, k in enumerate(known)]  # fmt: skip
+        nd = "" if index[1] is None else f"{index[1]:.5f}"
+        abbe = f"{(index[1] - 1) / (index[0] - index[2]):.1f}" if all(known) else ""
+        lines.append(f"| `{name}` | {nd} | {abbe} | {low:g}, {high:g} | {glass.source} |")
+    return "\n".join(lines)
+
+
+def mosaics_table() -> str:
+    """`sensor.PATTERNS`."""
+    lines = ["| `sensor.Mosaic(...)` | tile | rows |", "|---|---|---|"]
+    for name, rows in sensor.PATTERNS.items():
+        shown = " / ".join("".join("RGBW"[channel] for channel in row) for row in rows)
+        lines.append(f'| `"{name}"` | {len(rows)} x {len(rows[0])} | `{shown}` |')
+    return "\n".join(lines)
+
+
+def demosaics_table() -> str:
+    """`isp.DEMOSAICS`."""
+    lines = ["| `isp.Demosaic(...)` | patterns | PSNR on RGGB [dB] | time | |", "|---|---|---:|---:|---|"]
+    for name, row in isp.DEMOSAICS.items():
+        patterns = "Bayer" if row.bayer_only else "all"
+        lines.append(f'| `"{name}"` | {patterns} | {row.psnr:g} | {row.cost:g} | {row.note} |')
+    return "\n".join(lines)
+
+
+def command_line() -> str:
+    """The help of every command."""
+    import typer.testing
+
+    from kcam import cli
+
+    runner = typer.testing.CliRunner()
+    root: Any = typer.main.get_command(cli.app)
+    parts = []
+
+    def tell(words: list[str], command: Any) -> None:
+        shown = runner.invoke(cli.app, [*words, "--help"], env={"COLUMNS": "100", "TERM": "dumb"}, prog_name="kcam")
+        text = "\n".join(line.rstrip() for line in shown.output.strip().splitlines())
+        parts.append(f"## `{' '.join(['kcam', *words])}`\n\n```text\n{text}\n```")
+        for name, sub in getattr(command, "commands", {}).items():
+            tell([*words, name], sub)
+
+    tell([], root)
+    return "\n\n".join(parts)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "style": lambda: style_table("ours", style="style", note="what trains"),
     "seeds": lambda: style_table("seeds", style="style", seed="seed"),
@@ -739,6 +836,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "traps": traps_table,
     "plans": plans_table,
     "honesty": honesty_table,
+    "promise_tolerance": promise_tolerance,
+    "promise_effects": promise_effects,
     "training": training_table,
     "field": field_table,
     "benchmarks": benchmarks_table,
@@ -746,17 +845,21 @@ TABLES: dict[str, Callable[[], str]] = {
     "augmentation_speed": augmentation_speed_table,
     "segmentation": segmentation_table,
     "formats": formats_table,
+    "glasses": glasses_table,
+    "mosaics": mosaics_table,
+    "demosaics": demosaics_table,
+    "commands": command_line,
     "throughput": throughput_table,
 }
 
-# ---- the README ------------------------------------------------------------------------------------------------------
+# ---- the pages -------------------------------------------------------------------------------------------------------
 
 TABLE = re.compile(r"(<!-- generated: (\w+) -->\n)(?:(?!<!--).)*(<!-- end -->)", re.DOTALL)
 CODE = re.compile(r"(```python\n(?P<code>.*?)```\n)(?:\n?```text\n(?P<output>.*?)```\n)?", re.DOTALL)
 
 
 def with_tables(text: str) -> str:
-    """The README with its tables made anew."""
+    """A page with its tables made anew."""
     return TABLE.sub(lambda match: f"{match[1]}{TABLES[match[2]]()}\n{match[3]}", text)
 
 
@@ -771,22 +874,22 @@ def inside(folder: str | os.PathLike[str]) -> Iterator[None]:
         os.chdir(before)
 
 
-def run_code(text: str) -> Iterator[tuple[re.Match[str], str]]:
-    """Run the README's code in order, in one namespace; gives each block and what it printed."""
+def run_code(text: str, *, name: str = "README.md") -> Iterator[tuple[re.Match[str], str]]:
+    """Run a page's code in order, in one namespace; gives each block and what it printed."""
     namespace: dict[str, Any] = {}
     for match in CODE.finditer(text):
         printed = io.StringIO()
         line = text.count("\n", 0, match.start("code"))
-        code = compile("\n" * line + match["code"], str(README), "exec")  # errors name the README's own lines
+        code = compile("\n" * line + match["code"], name, "exec")  # errors name the page's own lines
         with contextlib.redirect_stdout(printed):
             exec(code, namespace)
         yield match, printed.getvalue()
 
 
-def with_output(text: str) -> str:
-    """The README with what its code prints printed anew."""
+def with_output(text: str, *, name: str) -> str:
+    """A page with what its code prints printed anew."""
     result, end = [], 0
-    for match, printed in run_code(text):
+    for match, printed in run_code(text, name=name):
         shown = f"\n```text\n{printed}```\n" if printed else ""
         result += [text[end : match.start()], match[1], shown]
         end = match.end()
@@ -921,16 +1024,16 @@ def main(arguments: list[str] | None = None) -> int:
     if options.traps:
         measure_traps()
     for name, draw in PICTURES.items() if options.pictures and not options.check else ():
-        draw(README.parent / "docs" / name)  # before the tables: some show what was measured for a picture
-    before = README.read_text()
-    with tempfile.TemporaryDirectory() as folder, inside(folder):
-        after = with_output(with_tables(before))
-    pages = {ROOT / page: with_tables((ROOT / page).read_text()) for page in PAGES} | {README: after}
+        draw(IMAGES / name)  # before the tables: some show what was measured for a picture
+    made = {}
+    for path in pages():
+        with tempfile.TemporaryDirectory() as folder, inside(folder):
+            made[path] = with_output(with_tables(path.read_text()), name=str(path))
+    old = [str(path.relative_to(ROOT)) for path, text in made.items() if path.read_text() != text]
     if options.check:
-        same = all(path.read_text() == text for path, text in pages.items())
-        sys.stdout.write("in step\n" if same else "out of step: run python docs/generate.py\n")
-        return int(not same)
-    for path, text in pages.items():
+        sys.stdout.write(f"out of step: {', '.join(old)}; run python docs/generate.py\n" if old else "in step\n")
+        return int(bool(old))
+    for path, text in made.items():
         path.write_text(text)
     return 0
 
