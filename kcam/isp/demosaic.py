@@ -314,6 +314,7 @@ DEMOSAICS: dict[str, DemosaicMethod] = {
     "kornia": DemosaicMethod(kornia, True, 30.6, 1.5, "bilinear as Kornia has it, for comparison"),
     "menon": DemosaicMethod(menon, True, 36.2, 15.0, "for evaluation: sharpest without noise, slow, piecewise"),
 }
+"""Name -> `DemosaicMethod`. A row more is a method more, and its tests."""
 
 
 def _encode(signal: Tensor) -> Tensor:

@@ -61,6 +61,11 @@ def compare(
     Returns:   a matplotlib Figure, 12.8 inches wide; `save_figure` or ``figure.savefig`` writes it.
     Raises:    TypeError for one camera alone, or what is no camera or no scene; ValueError for none, for a camera whose
                result has other than 1 or 3 channels, or a zoom outside 0..1.
+
+    Example:
+    >>> figure = plots.compare({"phone": Camera.phone(), "ideal": Camera.ideal()}, Scene.builtin("coffee", size=24))
+    >>> float(figure.get_figwidth())
+    12.8
     """
     named = _named(cameras)
     scene = first_of(scene, by="plots.compare")

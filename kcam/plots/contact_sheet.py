@@ -15,6 +15,12 @@ def contact_sheet(rows: Sequence[Sequence[Tensor]], *, titles: Sequence[str], la
     """Pictures (3,H,W) in rows; all in a row have one shape.
 
     Args:      rows: pictures.  titles: one per column.  labels: one per row.
+
+    Example:
+    >>> pictures = [[torch.rand(3, 8, 8), torch.rand(3, 8, 8)]]
+    >>> figure = plots.contact_sheet(pictures, titles=["before", "after"], labels=["noise"])
+    >>> len(figure.axes)
+    2
     """
     side, gap, edge, head = 3.6, 0.12, 0.35, 0.75
     heights = [side * row[0].shape[-2] / row[0].shape[-1] for row in rows]

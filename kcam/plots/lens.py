@@ -64,6 +64,11 @@ def section_figure(
     Args:      heights: of object points, Y / D; None for 0, 0.7 and 1 times the edge of the field.
                distance: of those points [m], inf allowed.
     Raises:    ValueError for a point of which no light passes.
+
+    Example:
+    >>> figure = plots.section_figure(optics.CompoundLens.preset("cooke_triplet"), heights=[0.0, 0.2])
+    >>> len(figure.axes)
+    1
     """
     up = _chosen(lens, heights, FIELDS_IN_SECTION, distance)
     section = _section(lens, up, distance)
@@ -86,6 +91,12 @@ def spot_figure(
 
     Args:      heights: of object points, Y / D, up to 5; None for five up to the edge of the field.
                wavelengths: [m]; None for `SPECTRAL_LINES`. distance: as of `section_figure`.
+
+    Example:
+    >>> lens = optics.CompoundLens.preset("cooke_triplet", focus_distance=2.0)
+    >>> figure = plots.spot_figure(lens, heights=[0.0, 0.2], distance=2.0)
+    >>> len(figure.axes)
+    2
     """
     sheet = Sheet(2 * _EDGE + _WIDTH, _HEAD + _CELL + 0.95)
     _heading(sheet, lens, title, distance)
@@ -104,6 +115,12 @@ def opd_figure(
     """Wavefronts over the stop at the middle wavelength, and their fans at all, on the sphere about the chief ray.
 
     Args:      as of `spot_figure`.
+
+    Example:
+    >>> lens = optics.CompoundLens.preset("cooke_triplet", focus_distance=2.0)
+    >>> figure = plots.opd_figure(lens, heights=[0.0, 0.2], distance=2.0)
+    >>> len(figure.axes)
+    4
     """
     sheet = Sheet(2 * _EDGE + _WIDTH, _HEAD + 2 * _CELL + 2 * _ROW + 0.75)
     _heading(sheet, lens, title, distance)
@@ -116,6 +133,12 @@ def field_figure(lens: CompoundLens, curves: FieldCurves, *, title: str = "Over 
     """Relative illumination, distortion, lateral colour, spot size and MTF over the image height.
 
     Args:      curves: of `lens.field_curves(...)`.
+
+    Example:
+    >>> lens = optics.CompoundLens.preset("cooke_triplet")
+    >>> figure = plots.field_figure(lens, lens.field_curves([0.0, 0.2]))
+    >>> len(figure.axes)
+    5
     """
     sheet = Sheet(2 * _EDGE + _WIDTH, _HEAD + _CELL + 0.95)
     _heading(sheet, lens, title)
@@ -133,6 +156,12 @@ def lens_figure(
     """Section, spots, wavefronts and field curves of a lens on one sheet, up to the last height of the curves.
 
     Args:      curves: of `lens.field_curves(...)`. distance: of the object [m], inf allowed.
+
+    Example:
+    >>> lens = optics.CompoundLens.preset("cooke_triplet")
+    >>> figure = plots.lens_figure(lens, lens.field_curves([0.0, 0.2]), title="A Cooke triplet")
+    >>> len(figure.axes)
+    21
     """
     edge = float(curves.heights[-1])
     up, rows = ([edge * share for share in shares] for shares in (FIELDS_IN_SECTION, FIELDS_IN_ROWS))
@@ -187,7 +216,17 @@ def _heading(sheet: Sheet, lens: CompoundLens, title: str, distance: float | Non
 
 
 def lens_text(lens: CompoundLens) -> str:
-    """Focal length, f-number, back focus and pupils at the focus wavelength, a line for each."""
+    """Focal length, f-number, back focus and pupils at the focus wavelength, a line for each.
+
+    Example:
+    >>> print(plots.lens_text(optics.CompoundLens.preset("cooke_triplet")))
+    focal length    50 mm at 550 nm
+    f-number        f/4.32
+    back focus      42.42 mm
+    sensor          42.42 mm behind the last vertex
+    entrance pupil  11.58 mm wide, 11.51 mm behind the first vertex
+    exit pupil      11.85 mm wide, 8.754 mm before the last vertex
+    """
     first, at = lens.first_order(), f"at {lens.focus_wavelength / nm:.0f} nm"
     sensor = _number(lens.sensor_distance)
 

@@ -20,7 +20,12 @@ from kcam.units import nm, um
 
 
 def psf_image(psf: Tensor, colour: np.ndarray) -> np.ndarray:
-    """A PSF (H,W) in the colour of its light, (H,W,3): scaled to its own peak, its square root shown."""
+    """A PSF (H,W) in the colour of its light, (H,W,3): scaled to its own peak, its square root shown.
+
+    Example:
+    >>> plots.psf_image(torch.rand(5, 7), plots.light_colours(torch.tensor([550 * nm]))[0]).shape
+    (5, 7, 3)
+    """
     return _square_root(psf[..., None].numpy() * colour**2.2)
 
 
@@ -31,6 +36,7 @@ def _square_root(image: np.ndarray) -> np.ndarray:
 SHARE_SHOWN = 0.97
 """Of the light of each PSF in its window of 255 pixels: what the panels of a PSF figure hold of it at least."""
 CURVE_COLOURS = ("#c8553d", "#1c1c22", "#2a9d8f", "#3f6fd8", "#8f5fbf", "#b8860b")
+"""Of curves by distance, the first ones: see `distance_colours`."""
 
 
 def psf_figure(
@@ -48,6 +54,12 @@ def psf_figure(
                distances: [m], inf allowed; None for 0.4 times the focus, the focus, 2.5 times that, and infinity.
                wavelengths: [m]; None for 450, 500, 550, 600 and 650 nm.
     Raises:    TypeError for what is neither.
+
+    Example:
+    >>> lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(20 * mm), focus_distance=2.0)
+    >>> figure = plots.psf_figure(lens, distances=[1.0, 2.0], wavelengths=[550 * nm])
+    >>> len(figure.axes)
+    6
     """
     if isinstance(imaging, optics.Lens):
         imaging = optics.Imaging(imaging)
@@ -149,7 +161,12 @@ def psf_figure(
 
 
 def optics_text(imaging: optics.Imaging) -> str:
-    """The lens and its pixels in a line."""
+    """The lens and its pixels in a line.
+
+    Example:
+    >>> plots.optics_text(Camera.phone()[0])
+    'Focal length 4.3 mm, f/1.8, in focus at 2 m;  pixels of 1.4 µm'
+    """
     lens, pixels = imaging.lens, f"pixels of {float(imaging.pixel_pitch) / um:.3g} \u00b5m"
     if not isinstance(lens, (optics.Lens, optics.CompoundLens)):
         return f"{type(lens).__name__};  {pixels}"
@@ -160,7 +177,12 @@ def optics_text(imaging: optics.Imaging) -> str:
 
 
 def distance_colours(count: int) -> list[Any]:
-    """A colour for each of so many curves, no two alike: a few by name, more along a scale."""
+    """A colour for each of so many curves, no two alike: a few by name, more along a scale.
+
+    Example:
+    >>> len(plots.distance_colours(9)), plots.distance_colours(2)
+    (9, ['#c8553d', '#1c1c22'])
+    """
     if count <= len(CURVE_COLOURS):
         return list(CURVE_COLOURS[:count])
     scale = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, count))[:, :3]
@@ -182,7 +204,16 @@ def _finish(axes: Any, *, title: str, label: str, end: float) -> None:
 
 
 def reach_of(psf: Tensor, *, share: float) -> int:
-    """Half the width of the square around the origin that holds this share of every PSF's light in its window."""
+    """Half the width of the square around the origin that holds this share of every PSF's light in its window [pixels].
+
+    6 at least, as far as the window goes.
+
+    Example:
+    >>> psf = torch.zeros(1, 1, 33, 33)
+    >>> psf[..., 8:25, 8:25] = 1 / 17**2  # a blur of 17 x 17 pixels
+    >>> plots.reach_of(psf, share=0.99)
+    8
+    """
     height, width = psf.shape[-2:]
     for reach in range(6, min(height, width) // 2):
         inside = centre(psf, reach).sum((-2, -1)) / psf.sum((-2, -1)).clamp(min=1e-30)
@@ -192,6 +223,12 @@ def reach_of(psf: Tensor, *, share: float) -> int:
 
 
 def centre(psf: Tensor, reach: int) -> Tensor:
-    """The square around the origin of PSFs (..., H, W), 2 * reach + 1 pixels wide."""
+    """The square around the origin of PSFs (..., H, W), 2 * reach + 1 pixels wide.
+
+    Example:
+    >>> psf = torch.arange(25.0).view(1, 1, 5, 5)
+    >>> plots.centre(psf, 1).shape, float(plots.centre(psf, 0))  # the origin is at n // 2
+    (torch.Size([1, 1, 3, 3]), 12.0)
+    """
     row, column = (size // 2 for size in psf.shape[-2:])
     return psf[..., row - reach : row + reach + 1, column - reach : column + reach + 1]

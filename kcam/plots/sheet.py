@@ -16,26 +16,57 @@ from matplotlib.textpath import TextPath
 from kcam import files
 from kcam.plots.pictures import check_writable
 
-INK, MUTED, FAINT = "#1c1c22", "#75757f", "#e2e2e8"
-TITLE, LABEL, SMALL = 15.0, 10.0, 8.5
+INK = "#1c1c22"
+"""Colour of text and curves."""
+MUTED = "#75757f"
+"""Colour of what explains."""
+FAINT = "#e2e2e8"
+"""Colour of grids and frames."""
+TITLE = 15.0
+"""Size of a figure's title [points]."""
+LABEL = 10.0
+"""Size of labels and of the titles of axes [points]."""
+SMALL = 8.5
+"""Size of captions and ticks [points]."""
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
+"""Formats that `save_figure` writes."""
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, resolution: float = 144) -> None:
-    """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`."""
+    """Write a figure at `resolution` dots per inch; ValueError as in `check_writable`.
+
+    Example:
+    >>> figure = plots.contact_sheet([[torch.rand(3, 8, 8)]], titles=["noise"], labels=["one"])
+    >>> plots.save_figure(figure, "sheet.png", resolution=72)
+    >>> bool(abs(Scene.from_file("sheet.png", depth=2.0).shape[2] - 72 * figure.get_figwidth()) < 1)  # pixels
+    True
+    """
     check_writable(path, suffixes=FIGURE_SUFFIXES)
     files.replace(path, figure_bytes(figure, resolution=resolution, format=Path(path).suffix.lower()[1:]))
 
 
 def figure_bytes(figure: Figure, *, resolution: float = 144, format: str = "png") -> bytes:
-    """A figure as the content of a file, at `resolution` dots per inch."""
+    """A figure as the content of a file, at `resolution` dots per inch.
+
+    Example:
+    >>> figure = plots.contact_sheet([[torch.rand(3, 8, 8)]], titles=["noise"], labels=["one"])
+    >>> plots.figure_bytes(figure)[1:4]  # a PNG says so
+    b'PNG'
+    """
     content = io.BytesIO()
     figure.savefig(content, dpi=resolution, facecolor="white", format=format)
     return content.getvalue()
 
 
 class Sheet:
-    """A figure whose parts are placed in inches from its top left corner, so that nothing overlaps at any size."""
+    """A figure whose parts are placed in inches from its top left corner, so that nothing overlaps at any size.
+
+    Example:
+    >>> sheet = plots.Sheet(6.0, 4.0)
+    >>> axes = sheet.axes(0.5, 0.5, 2.0, 1.5)
+    >>> [float(inches) for inches in sheet.figure.get_size_inches()]
+    [6.0, 4.0]
+    """
 
     def __init__(self, width: float, height: float) -> None:
         self.width, self.height = width, height
@@ -63,7 +94,12 @@ class Sheet:
 
 
 def shortened(text: str, width: float, *, size: float = LABEL, weight: str = "normal") -> str:
-    """A text in one line that is at most so wide [inches]: cut off at its end, which an ellipsis shows."""
+    """A text in one line that is at most so wide [inches]: cut off at its end, which an ellipsis shows.
+
+    Example:
+    >>> plots.shortened("a text that is too long for its place", width=1.0)
+    'a text...…'
+    """
     font = FontProperties(size=size, weight=weight)
 
     def wide(part: str) -> float:
@@ -80,7 +116,12 @@ def shortened(text: str, width: float, *, size: float = LABEL, weight: str = "no
 
 
 def duration(seconds: float) -> str:
-    """A time for people, from milliseconds to days: three figures at most."""
+    """A time for people, from milliseconds to days: three figures at most.
+
+    Example:
+    >>> [plots.duration(seconds) for seconds in (0.0042, 7.5, 4000.0)]
+    ['4.2 ms', '7.5 s', '66.7 min']
+    """
     for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.3g} {unit}"
@@ -90,7 +131,14 @@ def duration(seconds: float) -> str:
 
 
 def quiet(axes: Any) -> None:
-    """Axes that stand back behind their curves: a faint grid, two spines, small ticks."""
+    """Axes that stand back behind their curves: a faint grid, two spines, small ticks.
+
+    Example:
+    >>> axes = plots.Sheet(6.0, 4.0).axes(0.5, 0.5, 2.0, 1.5)
+    >>> plots.quiet(axes)
+    >>> axes.spines["top"].get_visible()
+    False
+    """
     axes.grid(color=FAINT, lw=0.8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED)
@@ -99,12 +147,22 @@ def quiet(axes: Any) -> None:
 
 
 def percent_or_more(share: float) -> str:
-    """A share that is not less than the text says: "97% or more", "less than 1%"."""
+    """A share that is not less than the text says: "97% or more", "less than 1%".
+
+    Example:
+    >>> plots.percent_or_more(0.978), plots.percent_or_more(0.004)
+    ('97% or more', 'less than 1%')
+    """
     return f"{math.floor(100 * min(share, 1.0))}% or more" if share >= 0.01 else "less than 1%"
 
 
 def metres(distance: float) -> str:
-    """A distance for people."""
+    """A distance for people.
+
+    Example:
+    >>> [plots.metres(distance) for distance in (0.05, 2.0, math.inf)]
+    ['5 cm', '2 m', 'infinity']
+    """
     if math.isinf(distance):
         return "infinity"
     return f"{distance:.3g} m" if distance >= 1 else f"{distance * 100:.3g} cm"

@@ -62,7 +62,13 @@ DOES: tuple[tuple[type[nn.Module] | tuple[type[nn.Module], ...], str], ...] = (
 
 @dataclass(frozen=True)
 class Step:
-    """A signal (B,C,H,W), what made it (an Imaging with the filter that it absorbs is one step), and in which time."""
+    """A signal (B,C,H,W), what made it (an Imaging with the filter that it absorbs is one step), and in which time.
+
+    Example:
+    >>> step = next(iter(plots.steps(Camera.ideal(), Scene.builtin("star", size=16))))
+    >>> step.name, tuple(step.signal.shape), step.seconds >= 0
+    ('ColourFilter', (1, 3, 16, 16), True)
+    """
 
     name: str
     stages: tuple[nn.Module, ...]
@@ -113,6 +119,11 @@ def pipeline(
     Returns:   a matplotlib Figure, 12.8 inches wide; `save_figure` or ``figure.savefig`` writes it.
     Raises:    TypeError for what is no Camera or no Scene; ValueError for a camera without stages, an empty batch, or a
                zoom outside 0..1.
+
+    Example:
+    >>> figure = plots.pipeline(Camera.phone(), Scene.builtin("coffee", size=24))
+    >>> float(figure.get_figwidth())
+    12.8
     """
     first = first_of(scene, by="plots.pipeline")
     check_camera(camera, by="plots.pipeline")
@@ -122,7 +133,13 @@ def pipeline(
 
 
 def steps(camera: Camera, scene: Scene, *, generator: torch.Generator | None = None) -> Iterator[Step]:
-    """Take a picture step by step, with the time of each. Arguments: as `Camera.forward`."""
+    """Take a picture step by step, with the time of each. Arguments: as `Camera.forward`.
+
+    Example:
+    >>> steps = list(plots.steps(Camera.phone(), Scene.builtin("coffee", size=24)))
+    >>> [step.name for step in steps][:3]
+    ['Imaging + ColourFilter', 'Mosaic', 'Exposure']
+    """
     behind, start = 0, perf_counter()
     for count, name, signal in camera.walk(scene, generator=generator):
         yield Step(name, tuple(camera.stages[behind:count]), signal, perf_counter() - start)
@@ -142,6 +159,13 @@ def pipeline_figure(
     """`pipeline` of a picture that is being taken, or was: `steps` of this camera and scene, one sample.
 
     Args:      subtitle: None for the lens, the scene's size and distance, and the time in all.
+
+    Example:
+    >>> camera, scene = Camera.phone(), Scene.builtin("coffee", size=24)
+    >>> taken = list(plots.steps(camera, scene))
+    >>> figure = plots.pipeline_figure(camera, scene, taken, subtitle="a cup")
+    >>> [step.name for step in taken][:2]
+    ['Imaging + ColourFilter', 'Mosaic']
     """
     panels: list[_Panel] = []
     behind: list[nn.Module] = []

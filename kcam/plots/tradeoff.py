@@ -24,6 +24,7 @@ KNOB_COLOURS = {
     "pixels": "#d0478f",
     "rank": "#7a5230",
 }
+"""Of the points of each knob in `tradeoff_figure`."""
 
 
 def tradeoff_figure(result: Sweep) -> Figure:
@@ -31,6 +32,13 @@ def tradeoff_figure(result: Sweep) -> Figure:
 
     Filled marks were timed on whole pictures, open ones on a few of their PSFs. An error too small for the axis stands
     on its lower edge as a triangle.
+
+    Example:
+    >>> from kcam.tradeoff import Row, Sweep
+    >>> rows = (Row("default", "as it is", raw_rms=1e-4, psf_l1=1e-4, seconds=0.4, default=True),
+    ...         Row("wavelengths", "7 wavelengths", raw_rms=2e-3, psf_l1=0.1, seconds=0.1))
+    >>> len(plots.tradeoff_figure(Sweep("Two settings", "a wall", rows)).axes)
+    2
     """
     edge, head, width, height, gap = 0.75, 1.55, 8.2, 4.9, 0.95
     sheet = Sheet(edge + width + 0.25, head + 2 * height + gap + 0.6)

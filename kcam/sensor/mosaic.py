@@ -27,6 +27,7 @@ PATTERNS: dict[str, tuple[tuple[int, ...], ...]] = {
     "x_trans": _tile("GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG"),
     "rgbw": _tile("WBWG", "BWGW", "WGWR", "GWRW"),
 }
+"""Name of a colour filter array -> its tile: rows of channels, 0 red, 1 green, 2 blue, 3 white."""
 
 
 def pattern_tile(pattern: str) -> Tensor:

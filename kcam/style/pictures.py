@@ -261,4 +261,5 @@ STYLES: dict[str, Callable[[tuple[int, int], Generator], Array]] = {
     "woodcut": woodcut,
     "watercolour": watercolour,
 }
+"""Name -> what paints a style picture of a size: see `painting`."""
 """Each paints (H, W, 3) of a given shape."""

@@ -158,3 +158,4 @@ PRESETS: dict[str, Preset] = {
         epochs=50,
     ),
 }
+"""Name -> a way to train, as `kcam train --preset` takes it."""

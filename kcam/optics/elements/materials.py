@@ -180,6 +180,7 @@ GLASSES = {
         "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 C; one-term fit by Polyanskiy",
     ),
 }
+"""Name -> dispersion: coefficients of its Sellmeier equation, the wavelengths [um] of the fit, and the source."""
 
 
 def refractive_index(glass: str | float | Glass, *, wavelengths: Tensor) -> Tensor:

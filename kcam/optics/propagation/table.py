@@ -19,6 +19,7 @@ from kcam.optics.propagation.spectrum import ANGULAR_SPECTRUM
 _EXACT = (MATRIX, CHIRP_Z, FFT, RADIAL)
 _ROWS = (*_EXACT, *(row.in_fresnel_range() for row in _EXACT), ANGULAR_SPECTRUM, RAYS, REFERENCE)
 PROPAGATORS = {(row.physics, row.method): row for row in _ROWS}
+"""(propagator, method) -> the row that computes PSFs so: its function, range, error and cost."""
 PHYSICS = tuple(dict.fromkeys(physics for physics, _ in PROPAGATORS))
 
 
