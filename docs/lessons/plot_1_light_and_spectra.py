@@ -195,8 +195,8 @@ for lamp, name in lamps.items():
 # ---------
 #
 # 1. Replace ``"FL11"`` by ``"HP1"``, a sodium street lamp, in ``lamps`` and in ``published`` (its chromaticity is
-#    0.533, 0.415), and print ``lab(paints, "HP1")[13:15]`` beside ``lab(paints, "D65")[13:15]``: the patches "green" and
-#    "red", whose second number runs from green to red. Where has most of the difference gone?
+#    0.533, 0.415), and print ``lab(paints, "HP1")[13:15]`` beside ``lab(paints, "D65")[13:15]``: the patches "green"
+#    and "red", whose second number runs from green to red. Where has most of the difference gone?
 # 2. Add some of the black to the red paint, ``paints[14] + 0.3 * black``, and plot both. Print ``lab(...)`` of the two
 #    under ``"D65"``, where they are equal, and under ``"A"``.
 # 3. Print ``spectral.rgb_error(wavelength_grid(count=n))`` for n from 6 to 14: by how much colours of sRGB come back
@@ -209,4 +209,4 @@ for lamp, name in lamps.items():
 # Am. J. Psychol. 95, 537 (1982): metameric blacks. Mallett and Yuksel, *Spectral Primary Decomposition for Rendering
 # with sRGB Reflectance*, EGSR 2019. CIE 15, *Colorimetry*: the observer and the lamps.
 #
-# Next: lesson 2, one lens, in which this light is focused, and colours part.
+# Next: :doc:`plot_2_one_lens`, in which this light is focused, and colours part.
