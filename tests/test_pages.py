@@ -1,15 +1,20 @@
-"""The README says what is so: its code prints what it shows, its tables are generated, its claims have tests."""
+"""README and site say what is so: code prints what they show, tables are generated, claims have tests, scripts run."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
 import json
+import random
+import os
 import re
 import shlex
+import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -25,7 +30,7 @@ from kcam.sensor.colour_filter import fitted
 from kcam.units import mm, um
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
+DOCS = ROOT / "docs"
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 EXAMPLES = {
     "train_doe": ["--steps", "4", "--out", "doe.png"],
@@ -38,6 +43,8 @@ EXAMPLES = {
     "plan_scenes": ["--size", "40", "--out", "plans"],
     "reconstruct": ["--size", "40", "--steps", "10", "--out", "reconstructed.png"],
 }
+SAMPLED = random.Random(25)
+"""Of pages and scripts a sample is run among the quick tests, all among the slow ones."""
 SLOW = ("plan_scenes", "train_lens", "lens_gallery", "augmentation_gallery")
 
 
@@ -52,17 +59,25 @@ def load(path: Path) -> ModuleType:
     return module
 
 
-generate = load(ROOT / "docs" / "generate.py")
-sys.path.append(str(ROOT / "data_tools"))  # where its scripts find what they share
+generate = load(DOCS / "generate.py")
+PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in generate.pages()}
+README = PAGES["README.md"]
 
 
-def section(title: str) -> str:
-    """What stands under a heading."""
-    return re.split(r"\n##+ ", README.split(f"# {title}\n", 1)[1])[0]
+def page(name: str) -> str:
+    """A page of the site."""
+    return PAGES[f"docs/{name}.md"]
 
 
-def code_blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def code_blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def sampled(names: Iterable[str], count: int) -> list[Any]:
+    """All of them, of which those that are not in the sample are slow."""
+    names = sorted(names)
+    quick = set(SAMPLED.sample(names, count))
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
 def code_lines(block: str) -> int:
@@ -87,16 +102,50 @@ def test_comparison_sees_what_differs() -> None:
     assert not same_but_for_rounding("1 2", "1")
 
 
-def test_code_prints_what_the_readme_shows(tmp_path: Path) -> None:
+WITH_CODE = [name for name, text in PAGES.items() if "```python" in text]
+
+
+@pytest.mark.parametrize("name", sampled(WITH_CODE, 5))
+def test_code_prints_what_a_page_shows(name: str, tmp_path: Path) -> None:
     with generate.inside(tmp_path):
-        blocks = list(generate.run_code(README))
-    assert len(blocks) == len(code_blocks("python")) >= 6
+        blocks = list(generate.run_code(PAGES[name], name=name))
+    assert len(blocks) == len(code_blocks(PAGES[name], "python")) >= 1
     for match, printed in blocks:
         assert same_but_for_rounding(printed, match["output"] or ""), f"{match['code']}\nprints\n{printed}"
 
 
+SCRIPTS = [str(path.relative_to(DOCS)) for folder in ("lessons", "recipes", "pictures") for path in
+           sorted((DOCS / folder).glob("plot_*.py"))]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sampled(SCRIPTS, 3))
+def test_script_runs(name: str, tmp_path: Path) -> None:
+    """As a user would, in a process of its own: warnings are errors."""
+    environment = os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-W", "error", str(DOCS / name)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not list(tmp_path.iterdir()), "a script leaves nothing behind"
+
+
+@pytest.mark.parametrize("path", sorted((DOCS / "recipes" / "long").glob("plot_*.py")), ids=lambda path: path.stem)
+def test_the_page_of_a_long_script_is_of_this_script(path: Path) -> None:
+    long_scripts = load(DOCS / "_ext" / "long_scripts.py")
+    kept = DOCS / long_scripts.PAGES / f"{path.name}.md5"
+    assert kept.read_text().strip() == long_scripts.digest(path), "run make docs-all"
+
+
+def test_there_are_eight_lessons_and_thirty_pictures() -> None:
+    assert sum(name.startswith("lessons/") for name in SCRIPTS) == 8
+    assert sum(name.startswith("pictures/") for name in SCRIPTS) >= 30
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 180
+
+
 def test_the_first_code_is_the_camera_of_the_picture() -> None:
-    code = code_blocks("python")[0]
+    code = code_blocks(README, "python")[0]
     assert "size=180" in code
     namespace: dict[str, object] = {}
     exec(code.replace("size=180", "size=40").split("print(")[0], namespace)
@@ -107,10 +156,9 @@ def test_the_first_code_is_the_camera_of_the_picture() -> None:
 
 
 def test_the_first_code_has_fifteen_lines_and_the_training_twelve() -> None:
-    assert code_lines(code_blocks("python")[0]) <= 15
-    training = re.search(r"```python\n(.*?)```", section("Training a diffractive element"), re.DOTALL)
-    assert training is not None
-    assert code_lines(training[1]) <= 12
+    assert code_lines(code_blocks(README, "python")[0]) <= 15
+    imports, training = code_blocks(page("start/training"), "python")[0].split("\n\n", 1)
+    assert code_lines(training) <= 12
 
 
 @pytest.mark.parametrize(
@@ -158,8 +206,10 @@ def test_training_a_lens_brings_sharpness_with_the_focal_length_held() -> None:
 
 
 def shell_commands() -> list[str]:
-    lines = [line.split("#")[0].strip() for block in code_blocks("sh") for line in block.splitlines()]
-    inline = re.findall(r"`(kcam [a-z-].*?)`", README)
+    text = "\n".join(PAGES.values())
+    blocks = (re.sub(r"\\\\\n\s*", " ", block) for block in code_blocks(text, "sh"))
+    lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
+    inline = re.findall(r"`(kcam [a-z-].*?)`", text)
     return list(dict.fromkeys(line for line in lines + inline if line))
 
 
@@ -174,9 +224,11 @@ def test_shell_command_exists(line: str) -> None:
         if arguments[0].startswith("--"):
             assert arguments[0] in {"--help"} | {option for p in main.params for option in p.opts}
             return
-        command = main.commands[arguments[0]]  # type: ignore[attr-defined]
+        command: Any = main
+        while arguments and not arguments[0].startswith("-") and hasattr(command, "commands"):
+            command = command.commands[arguments.pop(0)]
         known = {option: parameter for parameter in command.params for option in parameter.opts}
-        for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
+        for option, value in zip(arguments, [*arguments[1:], ""], strict=False):
             if option.startswith("--"):
                 assert option in known or option == "--help"
                 assert option != "--camera" or value in PRESETS or value.endswith(".safetensors")
@@ -198,7 +250,7 @@ def test_shell_command_exists(line: str) -> None:
 
 def test_make_targets_in_the_text_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
-    prose = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+    prose = re.sub(r"```.*?```", "", "\n".join(PAGES.values()), flags=re.DOTALL)
     targets = set(re.findall(r"`make ([a-z-]+)`", prose))
     assert targets
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets), targets
@@ -209,16 +261,15 @@ def test_make_targets_in_the_text_exist() -> None:
 
 @pytest.mark.parametrize("name", generate.TABLES)
 def test_generated_table_is_in_step(name: str) -> None:
-    pages = [README, *((ROOT / page).read_text() for page in generate.PAGES)]
-    blocks = [re.search(rf"<!-- generated: {name} -->\n(.*?)\n<!-- end -->", page, re.DOTALL) for page in pages]
-    found = next((block for block in blocks if block), None)
-    assert found is not None, f"neither the README nor another page has a block {name}"
+    text = "\n".join(PAGES.values())
+    found = re.search(rf"<!-- generated: {name} -->\n(.*?)\n<!-- end -->", text, re.DOTALL)
+    assert found is not None, f"no page has a block {name}"
     assert found[1] == generate.TABLES[name](), "run python docs/generate.py"
 
 
 @pytest.mark.parametrize("name", generate.PLOTS)
 def test_plot_shows_the_committed_results(name: str) -> None:
-    with Image.open(ROOT / "docs" / name) as plot:
+    with Image.open(generate.IMAGES / name) as plot:
         assert plot.info["Source"] == generate.digest(generate.PLOTS[name]), "run python docs/generate.py --pictures"
 
 
@@ -287,24 +338,30 @@ def test_figures(value: float, text: str) -> None:
     assert generate.figures(value) == text
 
 
-def test_links_and_pictures_exist() -> None:
-    prose = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
-    targets = {target for target in re.findall(r"\]\(([^)#]+)\)", prose) if "://" not in target}
-    assert {"docs/overview.jpg", "docs/psf_gallery.jpg", "CHANGELOG.md", "LICENSE"} <= targets
-    assert not [target for target in targets if not (ROOT / target).exists()]
+MADE = ("gallery/", "learn/", "do/recipes/", "reference/api/")
+"""Folders of docs/ whose pages are made."""
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_and_pictures_exist(name: str) -> None:
+    prose = re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", prose):
+        path = Path(os.path.normpath((ROOT / name).parent / target))
+        made = path.is_relative_to(DOCS) and str(path.relative_to(DOCS)).startswith(MADE)
+        assert "://" in target or made or path.exists(), target
 
 
 @pytest.mark.parametrize("name", generate.PICTURES)
 def test_pictures_are_small_and_sharp_enough(name: str) -> None:
-    path = ROOT / "docs" / name
-    assert f"(docs/{name})" in README
+    path = generate.IMAGES / name
+    assert any(f"images/{name}" in text for text in PAGES.values())
     assert path.stat().st_size < 400_000
     with Image.open(path) as picture:
         assert 1200 <= picture.width <= 2000
 
 
 def test_paths_in_the_layout_exist() -> None:
-    lines = section("Where to find things").split("```")[1].splitlines()[1:]
+    lines = page("reference/layout").split("```")[1].splitlines()[1:]
     assert len(lines) > 10
     for line in lines:
         path, what = line.split(maxsplit=1)
@@ -322,8 +379,9 @@ def test_paths_in_the_layout_exist() -> None:
 
 
 def quoted_tests() -> list[tuple[str, str]]:
-    links = re.findall(r"\[`(test_\w+)`\]\((tests/[\w/]+\.py)\)", README)
-    comments = [(name, path) for path, name in re.findall(r"(tests/[\w/]+\.py)::(test_\w+)", README)]
+    text = "\n".join(PAGES.values())
+    links = re.findall(r"\[`(test_\w+)`\]\((?:\.\./\.\./)?(tests/[\w/]+\.py)\)", text)
+    comments = [(name, path) for path, name in re.findall(r"(tests/[\w/]+\.py)::(test_\w+)", text)]
     return sorted(set(links + comments))
 
 
@@ -336,9 +394,9 @@ def test_every_quoted_test_exists() -> None:
 
 
 def test_every_claim_in_the_two_tables_names_its_test() -> None:
-    for line in section("What is exact, and what is approximate").splitlines():
+    for line in page("understand/exact").splitlines():
         if line.startswith("| ") and not line.startswith("| what"):
-            assert "[`test_" in line or "| below |" in line, line
+            assert "[`test_" in line or "| [below]" in line, line
 
 
 def source_of(name: str, path: str) -> str:
@@ -351,8 +409,8 @@ def source_of(name: str, path: str) -> str:
 
 def test_bounds_in_the_two_tables_are_those_of_the_tests() -> None:
     checked = 0
-    for line in section("What is exact, and what is approximate").splitlines():
-        link = re.search(r"\[`(test_\w+)`\]\((tests/[\w/]+\.py)\)", line)
+    for line in page("understand/exact").splitlines():
+        link = re.search(r"\[`(test_\w+)`\]\(\.\./\.\./(tests/[\w/]+\.py)\)", line)
         if link is None or not line.startswith("| ") or "glasses" in line:  # the glasses' are in the oracles
             continue
         source = source_of(link[1], link[2])
@@ -364,7 +422,7 @@ def test_bounds_in_the_two_tables_are_those_of_the_tests() -> None:
 
 def test_stages_in_the_table_are_stages() -> None:
     lens = optics.Lens(optics.CircularAperture(1e-3), optics.ThinLens(1e-2), focus_distance=1.0)
-    rows = re.findall(r"^\| `((?:optics|sensor|isp)\..*?)` \|", section("How a camera is composed"), re.MULTILINE)
+    rows = re.findall(r"^\| `((?:optics|sensor|isp)\..*?)` \|", page("understand/camera"), re.MULTILINE)
     names = {"optics": optics, "sensor": sensor, "isp": isp, "lens": lens, "um": um}
     stages = [eval(row, names) for row in rows]
     assert all(isinstance(stage, kcam.Stage) for stage in stages)
@@ -376,7 +434,7 @@ def test_stages_in_the_table_are_stages() -> None:
 
 
 def test_names_in_the_text_are_all_there_are() -> None:
-    composed = section("How a camera is composed")
+    composed = page("understand/camera")
     elements = set(re.findall(r"`(\w+)`", composed.split("Elements of a lens", 1)[1].split("\n\n", 1)[0]))
     public = {
         name for name, value in vars(optics).items()
@@ -386,20 +444,20 @@ def test_names_in_the_text_are_all_there_are() -> None:
     assert f"({len(optics.GLASSES)} glasses" in composed
     assert all(f"`{name}`" in composed for name in isp.DEMOSAICS)
     assert all(f"`{name}`" in composed for name in sensor.PATTERNS if len(name) > 4 or name == "rgbw")
-    scenes = section("Photographs, cubes, charts").split("The built-in scenes", 1)[1]
+    scenes = page("do/scenes").split("The built-in scenes", 1)[1]
     assert set(re.findall(r"`(\w+)`", scenes)) == set(BUILTIN)
-    assert set(re.findall(r"^\| `Camera\.(\w+)\(\)`", README, re.MULTILINE)) == set(PRESETS)
+    assert set(re.findall(r"^\| `Camera\.(\w+)\(\)`", page("start/photograph"), re.MULTILINE)) == set(PRESETS)
 
 
 def test_filter_errors_are_those_of_the_fits() -> None:
-    text = " ".join(section("Limits").split())
+    text = " ".join(page("understand/limits").split())
     for name, label in (("nikon_5100", "Nikon"), ("sigma_sd_merrill", "Sigma"), ("kodak", "Kodak")):
         errors = ", ".join(f"{100 * error:.1f}" for error in fitted(name).errors)
         assert f"{errors} % ({label})" in text
 
 
-def test_numbers_of_the_benchmarks_stand_in_the_readme() -> None:
-    table = section("Accuracy and speed")
+def test_numbers_of_the_benchmarks_stand_on_their_page() -> None:
+    table = page("understand/benchmarks")
     for path in generate.RESULTS.glob("*.json"):
         rows = json.loads(path.read_text()).get("rows", [])
         ours = [row for row in rows if row.get("default") and "ratio" in row]
@@ -416,7 +474,7 @@ def test_colour_errors_are_those_that_the_test_asserts() -> None:
     for name, label in (("nikon", "Nikon"), ("sigma", "Sigma"), ("kodak", "Kodak")):
         found = re.search(rf'\("{name}", "D65", ([\d.]+), ([\d.]+)\)', source)
         assert found is not None
-        assert f"{label} {float(found[1]):.1f} / {float(found[2]):.1f}" in README
+        assert f"{label} {float(found[1]):.1f} / {float(found[2]):.1f}" in page("understand/exact")
 
 
 # ---- the changelog -----------------------------------------------------------------------------------------------
