@@ -127,7 +127,7 @@ class Camera(nn.Module):
         return picture
 
     def steps(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Iterator[tuple[str, Tensor]]:
-        """Take a picture stage by stage: (name of the stage, its signal), each computed when it is asked for.
+        """Take a picture stage by stage: (name of the stage, its signal (B,C,H,W)), each computed when asked for.
 
         An Imaging that absorbs the filter after it is one step, "Imaging + ColourFilter". Arguments: as `forward`.
         """
@@ -171,7 +171,8 @@ class Camera(nn.Module):
             yield count, name, signal
 
     def raw(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-        """What the sensor recorded: the signal just before the demosaic. Arguments: as `forward`.
+        """What the sensor recorded: the signal just before the demosaic, (B,1,H,W), or (B,C,H,W) of full planes; behind
+        an ADC 1.0 is full scale. Arguments: as `forward`.
 
         Raises:    ValueError if the camera has no demosaic.
         """

@@ -248,7 +248,10 @@ class Imaging(Stage):
         return result if colour_filter is None else colour_filter.finish(result)
 
     def psf_window(self, wavelengths: Tensor, *, vergences: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-        """Window of the PSF in pixels: at most 0.1 % of the light outside, or the window is the picture."""
+        """Window (H, W) of the PSF [pixels]: at most 0.1 % of the light outside, or the window is the picture.
+
+        Args: wavelengths: (L,) [m]. vergences: of the layers, (Z,) [1/m]. picture: (H, W) [pixels].
+        """
         if not self.accuracy.blur:
             return 1, 1
         if self.accuracy.psf_shape is not None:
@@ -337,7 +340,7 @@ class Imaging(Stage):
         return self.lens
 
     def defocus(self, wavelengths: Tensor) -> Defocus:
-        """How far light that is out of focus goes."""
+        """How far light that is out of focus goes: see `source.Defocus`; wavelengths (L,) [m]."""
         return self.lens.defocus(wavelengths, self.pixel_pitch) if self.accuracy.blur else Defocus()
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
@@ -360,7 +363,7 @@ class Imaging(Stage):
         return owner
 
     def psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
-        """At which the PSFs are computed: the bands', or the means of their groups'."""
+        """At which the PSFs are computed, (G,) [m]: the bands', or the means of their groups'."""
         owner = self.groups(wavelengths)
         if owner is None:
             return wavelengths
@@ -382,7 +385,7 @@ class Imaging(Stage):
         return self._bank_cache.get((self, wavelengths, where, shape, like.dtype, like.device), build)
 
     def working(self, scene: Scene) -> Tensor:
-        """The scene's planes in the type that is computed in: at least float32."""
+        """The scene's planes (B, K, H, W) in the type that is computed in: at least float32."""
         planes = scene.coefficients
         if self.accuracy.precision is not None:
             return planes.to(getattr(torch, self.accuracy.precision))
@@ -391,14 +394,16 @@ class Imaging(Stage):
         return planes.float()
 
     def vergences(self, scene: Scene, depth: Tensor) -> Tensor:
-        """Of the layers that a scene is cut into, (Z,): half as far apart where a few lights stand out, whose own blur
-        is seen, not its mean.
+        """Of the layers that a scene is cut into, (Z,) [1/m]: half as far apart where a few lights stand out, whose own
+        blur is seen, not its mean.
         """
         fine = depth.numel() > 1 and wide_range(scene)
         return self.depth_layers(depth, scene.wavelengths, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
 
     def layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Vergences of the layers in which there is anything, and the share of each pixel in them; None for one."""
+        """Vergences of the layers in which there is anything, (Z,) [1/m], and the share of each pixel in them,
+        (B, Z, H, W); None for one.
+        """
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=planes.device)
         vergences = self.vergences(scene, depth)
         if depth.ndim == 1 and len(depth) > 1:
@@ -413,7 +418,7 @@ class Imaging(Stage):
         return vergences[filled.to(vergences.device)], shares[:, filled.to(shares.device)]
 
     def filled(self, scene: Scene) -> Tensor:
-        """Vergences of the layers in which there is anything."""
+        """Vergences of the layers in which there is anything, (Z,) [1/m]."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=scene.coefficients.device)
         vergences = self.vergences(scene, depth)
         if depth.ndim < 2 or vergences.numel() == 1:
@@ -695,7 +700,7 @@ class Imaging(Stage):
         return float((psfs.undistorted(places) - places).norm(dim=-1).max()) / self.pixel_pitch
 
     def illuminated(self, scene: Scene) -> float:
-        """Relative illumination of an even scene where it is least: in the corners and the middle of the sides."""
+        """Relative illumination of an even scene where it is least, 0 to 1: in corners and the middle of sides."""
         places, psfs = self._outermost(scene)
         return float(psfs.illumination(places).min())
 

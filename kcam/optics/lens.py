@@ -173,7 +173,7 @@ class Lens(ElementStack):
         device: torch.device | None = None,
         field: Tensor | None = None,
     ) -> Query:
-        """The arguments of `psf`, checked, as one value."""
+        """The arguments of `psf`, checked, as one value, which a row of `PROPAGATORS` answers: ``row(query)``."""
         if device is None:
             device = next((t.device for t in (*self.parameters(), *self.buffers())), torch.device("cpu"))
         pixels = PixelGrid(check_pixel_pitch(pixel_pitch), shape, fill_factor, integrate, dtype, device)
@@ -293,7 +293,7 @@ class Lens(ElementStack):
         return found
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
-        """The window that holds all but 0.1 % of the light.
+        """The window (H, W) that holds all but 0.1 % of the light [pixels].
 
         Half width = blur + lambda d P / (2 pi^2 A 1e-3): the rays' displacement, and the tail that diffraction at a
         rim of length P around an area A spreads beyond a radius. Profiles of rings scatter light beyond their rays:
@@ -306,11 +306,11 @@ class Lens(ElementStack):
         return side, side
 
     def defocus_waves(self, wavelengths: Tensor) -> float:
-        """a^2 / (2 lambda) at the shortest wavelength."""
+        """a^2 / (2 lambda) at the shortest wavelength: waves at the rim for each 1/m of vergence."""
         return float(self.aperture.semi_aperture().detach()) ** 2 / (2 * float(wavelengths.min()))
 
     def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
-        """How far light is spread, for a planner."""
+        """How far light is spread, for a planner: see `source.Defocus`; wavelengths (L,) [m], pixel_pitch [m]."""
         pixels = PixelGrid(pixel_pitch, (1, 1))
         with torch.no_grad():
             query = self.question(Points(torch.zeros(1, dtype=torch.float64)), wavelengths, pixels)

@@ -189,7 +189,7 @@ class MeasuredPSF(nn.Module):
             return torch.einsum("kl,nlhw->nkhw", self._of_wavelengths(wavelengths).to(psfs), psfs)
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
-        """All that was measured."""
+        """All that was measured, (H, W) [pixels]."""
         ratio = self.pixel_pitch / pixels.pitch
         if abs(ratio - 1) < _SAME:
             return self.psfs.shape[-2], self.psfs.shape[-1]
@@ -206,7 +206,7 @@ class MeasuredPSF(nn.Module):
         return 0.0
 
     def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
-        """From the rms radius of the PSFs at each distance."""
+        """How far light is spread, from the rms radius of the PSFs at each distance: see `source.Defocus`."""
         with torch.no_grad():
             light = self.psfs.double().reshape(-1, *self.psfs.shape[-4:]).sum((0, 2))
             y, x = (torch.arange(n, device=light.device) - n // 2 for n in light.shape[-2:])

@@ -102,7 +102,10 @@ class CompoundLens(nn.Module):
 
     @classmethod
     def preset(cls, name: str, *, focus_distance: float = math.inf, focus_wavelength: float = 550e-9) -> CompoundLens:
-        """A lens from its patent: a name in `presets.PRESETS`. Raises: ValueError for an unknown one."""
+        """A lens from its patent: a name in `presets.PRESETS`; focus_distance [m], inf allowed, focus_wavelength [m].
+
+        Raises: ValueError for an unknown name, and as the constructor.
+        """
         return cls(*preset_surfaces(name), focus_distance=focus_distance, focus_wavelength=focus_wavelength)
 
     @classmethod
@@ -153,7 +156,7 @@ class CompoundLens(nn.Module):
         return [torch.ones_like(wavelengths), *(surface.index(wavelengths) for surface in self.surfaces)]
 
     def first_order(self, wavelength: float | None = None) -> FirstOrder:
-        """Focal length and pupils at a wavelength [m]; None for that of focus."""
+        """Focal length and pupils [m] at a wavelength [m]; None for that of focus."""
         grid = wavelength_grid([self.focus_wavelength if wavelength is None else wavelength])
         indices = [index[0] for index in self.indices(grid)]
         matrix = system_matrix(self.surfaces, indices)
@@ -171,7 +174,7 @@ class CompoundLens(nn.Module):
         )
 
     def focal_length(self, wavelength: float | None = None) -> float:
-        """Paraxial [m]."""
+        """Paraxial focal length [m] at a wavelength [m]; None for that of focus."""
         return float(self.first_order(wavelength).focal_length.detach())
 
     @property
@@ -311,6 +314,8 @@ class CompoundLens(nn.Module):
 
         On the sphere about the image of the chief ray through the middle of the paraxial exit pupil; positive where
         light comes late. Rays are aimed at the stop: S x S points of its bounding square, rows along +y.
+
+        Args: wavelengths, distances, field: as of `psf`. samples: S.
         """
         asked = self._asked(wavelengths, distances, field)
         nodes = self._nodes(asked.wavelengths, asked.vergences, asked.heights)
@@ -359,7 +364,10 @@ class CompoundLens(nn.Module):
     def image_point(
         self, wavelengths: Tensor | list[float], *, distances: Tensor | float, field: Tensor | None = None
     ) -> Tensor:
-        """Where each wavelength's chief ray lands on the sensor [m]: (F, Z, L, 2), without `field` (Z, L, 2)."""
+        """Where each wavelength's chief ray lands on the sensor [m]: (F, Z, L, 2), without `field` (Z, L, 2).
+
+        Args: as of `psf`.
+        """
         asked = self._asked(wavelengths, distances, field)
         chief = self._nodes(asked.wavelengths, asked.vergences, asked.heights).chief.y[..., 0]
         found = chief[..., None] * asked.directions[:, None, None]
@@ -372,7 +380,11 @@ class CompoundLens(nn.Module):
         wavelengths: Tensor | list[float] | None = None,
         distances: Tensor | float = math.inf,
     ) -> Tensor:
-        """Irradiance of a uniform radiance, over that on the axis, (F,): mean over wavelengths and distances."""
+        """Irradiance of a uniform radiance, over that on the axis, (F,): mean over wavelengths and distances.
+
+        Args: field: (F, 2) of X / D and Y / D. wavelengths: (L,) [m], None for that of focus. distances: [m], inf
+            allowed.
+        """
         asked = self._asked([self.focus_wavelength] if wavelengths is None else wavelengths, distances, field)
         heights = torch.cat([asked.heights.new_zeros(1), asked.heights])
         fitted = self.pupils(asked.wavelengths, asked.vergences, heights)
@@ -381,7 +393,10 @@ class CompoundLens(nn.Module):
         return (found[1:] / found[:1]).mean(1)
 
     def distortion(self, field: Tensor, *, wavelength: float | None = None, distance: float = math.inf) -> Tensor:
-        """Height of the chief ray's image over that of a lens without distortion, less 1, (F,)."""
+        """Height of the chief ray's image over that of a lens without distortion, less 1, (F,).
+
+        Args: field: (F, 2) of X / D and Y / D. wavelength: [m], None for that of focus. distance: [m], inf allowed.
+        """
         asked = self._asked([self.focus_wavelength if wavelength is None else wavelength], distance, field)
         near = 1e-4 * torch.ones(1, dtype=torch.float64)
         heights = torch.cat([near, asked.heights])
@@ -458,12 +473,14 @@ class CompoundLens(nn.Module):
         return found[torch.arange(len(places)), torch.arange(len(places))]
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:
-        """The window that holds all but 0.5 % of the light of points, on the axis unless they have positions."""
+        """The window (H, W) that holds all but 0.5 % of the light of points [pixels], on the axis unless they have
+        positions.
+        """
         reach = 0.0 if points.positions is None else float(points.positions.norm(dim=1).max())
         return self.over_field(reach, points.vergences, wavelengths).window(pixels)
 
     def defocus_waves(self, wavelengths: Tensor) -> float:
-        """a^2 / (2 lambda) at the shortest wavelength, of the entrance pupil."""
+        """a^2 / (2 lambda) of the entrance pupil at the shortest wavelength: waves at the rim for each 1/m."""
         return float(self.first_order().entrance_semi_diameter.detach()) ** 2 / (2 * float(wavelengths.min()))
 
     def defocus(self, wavelengths: Tensor, pixel_pitch: float) -> Defocus:
@@ -699,7 +716,8 @@ class CompoundLens(nn.Module):
     @no_more_than_free()
     def field_limit(self, *, least: float = 0.2, distance: float = math.inf) -> float:
         """Largest height Y / D up to which the relative illumination is above `least` and chief rays pass: by nested
-        intervals of the angle, to 0.001 degrees; that of 60 degrees where they do so up to there.
+        intervals of the angle, to 0.001 degrees; that of 60 degrees where they do so up to there. distance: of the
+        object [m], inf allowed.
         """
         self.check()
         vergences = 1 / check_distances(distance).reshape(-1)
