@@ -129,7 +129,7 @@ class RandomDefocus(RandomBlur):
     over each other from far to near, as `optics.Imaging` does. Such a map comes from `CameraSequential`, or as
     ``augment(image, inverse_depth=map)``, (B,1,H,W) or one number per sample (B,) [1/m], 0 at infinity.
 
-    Args:      focus: distance in focus [m]. f_number: N. distance: of the picture without a map [m]. Distances are
+    Args:      focus: distance in focus [m]. f_number: N > 0. distance: of the picture without a map [m]. Distances are
                    drawn uniformly in 1/m, inf allowed.
                focal_length: f [m]. pixel_pitch: [m]. By default a machine-vision camera, 8 mm with 4 um pixels.
                layers: of a depth map.

@@ -315,7 +315,7 @@ class CompoundLens(nn.Module):
         On the sphere about the image of the chief ray through the middle of the paraxial exit pupil; positive where
         light comes late. Rays are aimed at the stop: S x S points of its bounding square, rows along +y.
 
-        Args: wavelengths, distances, field: as of `psf`. samples: S.
+        Args: wavelengths, distances, field: as of `psf`. samples: S, points on each side.
         """
         asked = self._asked(wavelengths, distances, field)
         nodes = self._nodes(asked.wavelengths, asked.vergences, asked.heights)
