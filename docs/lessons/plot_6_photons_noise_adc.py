@@ -245,7 +245,7 @@ assert torch.allclose(slope, torch.ones_like(slope))
 # -------
 #
 # EMVA Standard 1288, release 4.0: all quantities of this lesson and how to measure them. Janesick, *Photon Transfer*
-# (SPIE 2007), chapters 5 to 7. Kingma and Welling, arXiv 1312.6114: gradients through chance. Bengio, Leonard and
+# (SPIE 2007): the curve. Kingma and Welling, arXiv 1312.6114: gradients through chance. Bengio, Leonard and
 # Courville, arXiv 1308.3432: the straight-through estimator. Widrow and Kollar, *Quantization Noise* (Cambridge 2008):
 # when 1/12 is right.
 #
