@@ -48,7 +48,7 @@ assert sensor.channel_masks("RGGB", 12, 12).double().mean((1, 2)).tolist() == [0
 #
 # .. math:: f_\mathrm{alias} = \frac{1}{2p} - f, \qquad \frac{1}{4p} < f < \frac{1}{2p}
 #
-# which is **aliasing**. Gray stripes of 0.4 cycles per pixel should come back in red as 0.1.
+# which is **aliasing**. Grey stripes of 0.4 cycles per pixel should come back in red as 0.1.
 
 size, frequency = 160, 0.4
 column = torch.arange(size, dtype=torch.float64)
@@ -62,16 +62,16 @@ assert math.isclose(alias, 0.5 - frequency)
 
 figure, ax = plt.subplots(figsize=(8, 2.8), layout="constrained")
 fine = torch.linspace(0, 40, 1001, dtype=torch.float64)
-ax.plot(fine, 0.5 + 0.4 * torch.cos(2 * math.pi * frequency * fine), color="0.7", label="gray stripes")
+ax.plot(fine, 0.5 + 0.4 * torch.cos(2 * math.pi * frequency * fine), color="0.7", label="grey stripes")
 ax.plot(column[:41:2], red[:21], "o", color="tab:red", label="what red pixels see")
 ax.plot(fine, 0.5 + 0.4 * torch.cos(2 * math.pi * alias * fine), color="tab:red", lw=1, label="the alias")
 ax.set(title="Aliasing in the red pixels of one row", xlabel="column [pixels]", ylabel="signal", ylim=(0, 1.3))
 ax.legend(frameon=False, ncols=3)
 
 # %%
-# In the green pixels the same stripes have another alias, and so a gray picture gets colours. A zone plate shows all
+# In the green pixels the same stripes have another alias, and so a grey picture gets colours. A zone plate shows all
 # frequencies at once: they grow from the middle outwards, to 0.5 cycles per pixel at the edges. Wherever they come near
-# one of the frequencies of the mosaic itself, (1/2, 0), (0, 1/2) and (1/2, 1/2) cycles per pixel, gray detail looks
+# one of the frequencies of the mosaic itself, (1/2, 0), (0, 1/2) and (1/2, 1/2) cycles per pixel, grey detail looks
 # exactly as coloured areas do, and the **demosaic**, which guesses the missing channels, makes colours of it.
 
 offset = torch.arange(size, dtype=torch.float64) - size // 2
@@ -81,12 +81,12 @@ raw = sensor.mosaic(zone_plate, pattern="RGGB")
 
 
 def false_colour(picture):
-    """RMS difference of red and blue from green: 0 where a gray picture has stayed gray."""
+    """RMS difference of red and blue from green: 0 where a grey picture has stayed grey."""
     return float((picture[:, ::2] - picture[:, 1:2]).square().mean().sqrt())
 
 
 figure, axes = plt.subplots(1, 4, figsize=(9, 2.8), layout="constrained")
-figure.suptitle("A gray zone plate, and what demosaics make of its mosaic")
+figure.suptitle("A grey zone plate, and what demosaics make of its mosaic")
 axes[0].imshow(plots.as_image(zone_plate[0]))
 axes[0].set_title("the scene")
 for ax, method in zip(axes[1:], ("bilinear", "malvar", "menon"), strict=True):
@@ -247,7 +247,7 @@ for ax, stop, picture in zip(axes, stops, seen, strict=True):
 #    ``"x_trans"`` and ``"quad_bayer"``. Two of them are within 1 dB; the third is far behind, for its samples of one
 #    colour lie in blocks, and the gaps between them are wider.
 # 3. Paint the zone plate red: ``zone_plate * torch.tensor([1.0, 0.2, 0.2])[:, None, None]``. Print the RMS error of
-#    each method in the middle, ``[..., 40:120, 40:120]``. On gray ``menon`` is five times as good as ``bilinear``, on
+#    each method in the middle, ``[..., 40:120, 40:120]``. On grey ``menon`` is five times as good as ``bilinear``, on
 #    red hardly better: what it assumes, that channels change together by equal amounts, no longer holds.
 #
 # Read on

@@ -137,12 +137,12 @@ for b in (6, 8, 10, 12):
 # The gain comes before the rounding, so that this fades at a high ISO. The photons do not.
 
 isos = np.array([100, 200, 400, 800, 1600, 3200, 6400])
-electrons = 0.2 * 0.8 * full_well * 100 / isos  # a gray of 20 %, where white fills 0.8 of full scale
+electrons = 0.2 * 0.8 * full_well * 100 / isos  # a grey of 20 %, where white fills 0.8 of full scale
 measured = []
 for iso, count in zip(isos, electrons, strict=True):
     converter = sensor.ADC(bits, black_level=black_level, gain=float(iso) / 100)
-    gray = torch.full((1, 1, 200, 200), count / full_well)
-    out = Camera(sensor.ShotNoise(full_well), sensor.ReadNoise(read_noise), converter)(gray, generator=random).double()
+    grey = torch.full((1, 1, 200, 200), count / full_well)
+    out = Camera(sensor.ShotNoise(full_well), sensor.ReadNoise(read_noise), converter)(grey, generator=random).double()
     measured.append(float((out.mean() - black_level / (2**bits - 1)) / out.std()))
 variance = electrons + read_noise**2 + 1 / (12 * (isos / 100 * gain) ** 2)
 law = electrons / np.sqrt(variance)
@@ -154,7 +154,7 @@ figure, ax = plt.subplots(figsize=(7, 3.4), layout="constrained")
 ax.loglog(isos, measured, "o", label="measured")
 ax.loglog(isos, law, "k:", label="equation")
 ax.loglog(isos, np.sqrt(electrons), color="tab:green", label="photons alone")
-ax.set(title="Signal to noise ratio of a gray of 20 %", xlabel="ISO", ylabel="SNR")
+ax.set(title="Signal to noise ratio of a grey of 20 %", xlabel="ISO", ylabel="SNR")
 ax.set_xticks(isos, isos)
 ax.set_yticks((1, 3, 10, 30), (1, 3, 10, 30))
 ax.minorticks_off()

@@ -183,14 +183,14 @@ axes[0].set_ylabel("b*: blue to yellow")
 # deeper, and those of the eye itself. So to meet the condition is not all that a filter is for.
 #
 # Where the condition fails, there are paints that the camera takes for one and the eye does not. The camera is blind to
-# 25 of 28 directions of a spectrum; some of these the eye sees. Add one to a gray, and no matrix, no curve and no
+# 25 of 28 directions of a spectrum; some of these the eye sees. Add one to a grey, and no matrix, no curve and no
 # network behind the sensor can find the difference:
 
 blind = torch.eye(28, dtype=torch.float64) - torch.linalg.pinv(three["Nikon 5100"]) @ three["Nikon 5100"]
 unseen = blind @ eye[0]  # of the eye's first curve what the camera does not see
 unseen = 0.15 * unseen / unseen.abs().max()
-gray = paints[names.index("neutral 5 (.70 D)")]
-pair = torch.stack([gray, gray + unseen])
+grey = paints[names.index("neutral 5 (.70 D)")]
+pair = torch.stack([grey, grey + unseen])
 signals = pair @ three["Nikon 5100"].T
 linear = pair @ eye.T @ spectral.xyz_to_srgb_matrix().T
 difference, to_the_eye = (signals[0] - signals[1]).abs().max(), deltaE_ciede2000(*lab(linear))
@@ -214,7 +214,7 @@ coded = isp.tone_curve(x[None, None])[0, 0]
 formula = torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 assert torch.allclose(coded, formula, atol=1e-6)
 lightness = lab(x[:, None].expand(-1, 3))[:, 0]
-print(f"a gray of 18 % is stored as {coded[180]:.3f}; its lightness L* is {lightness[180]:.1f} of 100")
+print(f"a grey of 18 % is stored as {coded[180]:.3f}; its lightness L* is {lightness[180]:.1f} of 100")
 print(f"numbers below 1 % of white: {255 * 0.01:.0f} without the curve, {255 * coded[10]:.0f} with it")
 
 figure, ax = plt.subplots(figsize=(6, 3.2), layout="constrained")

@@ -148,7 +148,7 @@ for name, value in gradients.items():
 assert math.isclose((gradients["Imaging + ColourFilter"] != 0).double().mean(), 1 / 3, abs_tol=0.01)
 
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.8), layout="constrained")
-figure.suptitle("The gradient of the loss, gray is 0: at the picture, at the raw, at the light behind the filter")
+figure.suptitle("The gradient of the loss, grey is 0: at the picture, at the raw, at the light behind the filter")
 for ax, name in zip(axes, ("ToneCurve", "ADC", "Imaging + ColourFilter"), strict=True):
     value = gradients[name][0, :, 8:48, 40:100]
     ax.imshow(plots.as_image(0.5 + value / (6 * value.std())))
