@@ -48,9 +48,11 @@ SPHINX := $(BIN)/python -m sphinx -b html -W --keep-going docs docs/_build/html
 
 docs: $(VENV)/docs.stamp
 	MPLBACKEND=Agg $(SPHINX)
+	$(BIN)/python docs/check_site.py
 
 docs-all: $(VENV)/docs.stamp
 	KCAM_DOCS_ALL=1 MPLBACKEND=Agg $(SPHINX)
+	$(BIN)/python docs/check_site.py
 
 test: $(VENV)/dev.stamp
 	$(PYTEST) -m "not slow"

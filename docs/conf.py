@@ -23,7 +23,7 @@ version = release = kcam.__version__
 extensions = [
     "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.doctest", "sphinx.ext.intersphinx",
     "sphinx.ext.viewcode", "sphinx-mathjax-offline", "myst_parser", "sphinx_copybutton", "sphinx_design",
-    "sphinx_gallery.gen_gallery", "sphinxcontrib.bibtex", "docstrings",
+    "sphinx_gallery.gen_gallery", "sphinxcontrib.bibtex", "docstrings", "thumbnails",
 ]  # fmt: skip
 exclude_patterns = ["_build", "lessons", "recipes", "pictures", "**/GALLERY_HEADER.rst", "**.ipynb", "**.py", "**.md5"]
 templates_path = ["_templates"]
@@ -118,5 +118,6 @@ html_theme_options = {
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
 html_sidebars = {"index": []}
+html_context = {"default_mode": "auto"}
 
 docstrings.write_reference(DOCS / "reference" / "api")

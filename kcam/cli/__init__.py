@@ -253,7 +253,7 @@ def lens(
     ] = "",
     distance: Annotated[str, typer.Option("--distance", help="of the points; else that of --focus, or inf")] = "",
     field: Annotated[
-        float, typer.Option("--field", help="largest Y / D; else where a fifth of the light is left, or rays are lost")
+        float, typer.Option("--field", help="largest Y / D; else a preset's own, or where a fifth of the light is left")
     ] = 0.0,
     wavelengths: Annotated[str, typer.Option("--wavelengths", help='in nanometres: "486, 546, 656"')] = "",
     frequency: Annotated[float, typer.Option("--frequency", help="of the MTF [line pairs per mm]")] = 30.0,
@@ -267,6 +267,7 @@ def lens(
         import torch
 
         from kcam import plots
+        from kcam.optics.compound.presets import PRESETS
         from kcam.units import WAVELENGTH_RANGE, mm
 
         plots.check_writable(out, suffixes=plots.FIGURE_SUFFIXES)
@@ -285,7 +286,8 @@ def lens(
                 before = float(shown.sensor_distance)
                 shown = shown.refocus("rms", distance=away, wavelengths=colours)
                 typer.echo(f"sensor moved by {(float(shown.sensor_distance) - before) / mm:+.4f} mm")
-            edge = field or shown.field_limit(distance=away)
+            meant = PRESETS[name].field if name in PRESETS else math.inf  # beyond it a phone's blur has no MTF left
+            edge = field or min(meant, shown.field_limit(distance=away))
             curves = shown.field_curves(
                 torch.linspace(0, edge, 11, dtype=torch.float64),
                 wavelengths=colours,

@@ -177,7 +177,7 @@ def _check_count(count: int, spread: float) -> None:
     if count > sampling.MAX_PUPIL_SAMPLES:
         raise ValueError(
             f"this MTF needs {count} pupil samples (blur {spread * 1e3:.3g} mm), more than "
-            f"{sampling.MAX_PUPIL_SAMPLES}. Use lower frequencies or a distance nearer to the focus."
+            f"{sampling.MAX_PUPIL_SAMPLES}. Use lower frequencies, a smaller field or a distance nearer to the focus."
         )
 
 
