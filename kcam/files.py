@@ -409,16 +409,16 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return from_json(metadata["kcam"], _Document, wrong=damaged, fix=FIX, hook=None), tensors
 
 
-def check_place(path: Path) -> None:
+def check_place(path: str | os.PathLike[str]) -> None:
     """ValueError where no file of that name can be: where there is a folder, or none to put it into.
 
     Example:
-    >>> import pathlib
     >>> from kcam import files
-    >>> files.check_place(pathlib.Path("nowhere/picture.png"))
+    >>> files.check_place("nowhere/picture.png")
     Traceback (most recent call last):
     ValueError: cannot write picture.png: there is no folder nowhere.
     """
+    path = Path(path)
     if path.is_dir():
         raise ValueError(f"cannot write {path.name}: there is a folder of that name. Choose another name.")
     if not path.absolute().parent.is_dir():

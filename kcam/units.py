@@ -93,6 +93,14 @@ def _perhaps(value: float, unit: str, *, example: str) -> str:
     return f"; did you mean {value:g} * {unit}?" if 0 < value < math.inf else f", such as {example}."
 
 
+def _unit_of(value: float, *, within: tuple[float, float], example: str) -> str:
+    """In which unit a length was probably meant: of what is given in millimetres those, if it can be."""
+    low, high = within
+    if example.endswith("* mm") and low <= value * mm <= high:
+        return "mm"
+    return "nm" if value >= 100 else "um"
+
+
 def check_length(value: Tensor | float, *, name: str, within: tuple[float, float], example: str) -> float:
     """A length in metres; ValueError that names the likely mistake outside a range, TypeError for what is no number.
 
@@ -112,7 +120,7 @@ def check_length(value: Tensor | float, *, name: str, within: tuple[float, float
     if not low <= metres <= high:
         raise ValueError(
             f"{name} {metres:g} is outside {low:g}..{high:g} m. Lengths are in metres"
-            f"{_perhaps(metres, 'nm' if metres >= 100 else 'um', example=example)}"
+            f"{_perhaps(metres, _unit_of(metres, within=within, example=example), example=example)}"
         )
     return metres
 

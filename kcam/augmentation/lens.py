@@ -27,7 +27,7 @@ from kcam.optics.compound.presets import PRESETS
 from kcam.optics.rendering.borders import BORDERS, border_index
 from kcam.scene import Scene
 from kcam.ste import clip_ste
-from kcam.units import check_distances, wavelength_grid
+from kcam.units import PIXEL_PITCH_RANGE, check_distances, wavelength_grid
 
 _VIEWS = 64  # kept
 _MOST_REACH = 0.99
@@ -188,7 +188,7 @@ class RandomLens(MovedPixels):
                 at = torch.tensor([[0.0, highest]], dtype=torch.float64)
                 landed = lens.image_point([lens.focus_wavelength], distances=distance, field=at)
                 radius = float(landed.norm())
-                widest = _WIDEST_PIXEL * lens.focus_wavelength * lens.f_number
+                widest = min(_WIDEST_PIXEL * lens.focus_wavelength * lens.f_number, PIXEL_PITCH_RANGE[1])
                 return _Circle(radius, widest, lens.image_heights(_MOST_REACH * radius))
 
         found: _Circle = self._circles[index].get(lens, build)

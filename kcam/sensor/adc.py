@@ -31,7 +31,7 @@ def quantise(
 
     Args:      signal: any shape, 1.0 = full well.  bits: 1..24, the steps that float32 can hold.
                black_level: the number that no light gives [DN].  gain: analogue gain, 1 at base ISO.
-           rounding: False leaves the steps out.
+               rounding: False leaves the steps out.
     Returns:   same shape, 1.0 = full scale (2^bits - 1 DN).
     Valid when the dtype holds the steps: float16 has 11 bits, bfloat16 8, and is given back with those.
 
@@ -50,8 +50,9 @@ class ADC(Stage):
     The overall system gain of EMVA 1288 is K = gain (2^bits - 1) / full_well [DN / electron].
 
     Args:      bits: 1..24.  black_level: the number that no light gives, 0 <= black_level < 2^bits - 1 [DN].
-               gain: analogue gain, > 0; None to take it from the context (ISO / 100).
-           rounding: False leaves the steps out, as a `Plan` may.
+               gain: analogue gain, > 0; None to take it from the context (ISO / 100). The black level is added behind
+               it, so that at a high gain it holds fewer electrons of read noise above 0.
+               rounding: False leaves the steps out, as a `Plan` may.
     Raises:    TypeError for bits that are no integer; ValueError for a value out of range.
 
     Example:

@@ -217,3 +217,12 @@ def test_steps_are_what_is_drawn() -> None:
     assert {round(1 / value, 6) for value in drawn["distance"].tolist()} == {0.0, 0.5, 1.0}
     one = KC.RandomLens("ef50", (0.6, 0.9), steps=1).generate_parameters((4, 3, 8, 8))
     assert one["reach"].tolist() == pytest.approx([0.75] * 4)
+
+
+@pytest.mark.parametrize("f_number", [8.0, 16.0, 30.0])
+def test_a_slow_lens_and_a_small_picture_keep_pixels_within_their_range(f_number: float) -> None:
+    """200 wavelengths times the f-number are above a millimetre beyond f/9."""
+    front = optics.Surface(radius=52 * mm, thickness=1 * mm, glass="N-BK7", semi_diameter=25 / f_number * mm, stop=True)
+    lens = optics.CompoundLens(front, optics.Surface(radius=-52 * mm, semi_diameter=10 * mm), focus_distance=2.0)
+    out = KC.RandomLens(lens, reach=0.1, steps=1, p=1.0)(picture(1, 3, 16, 16))
+    assert out.isfinite().all()

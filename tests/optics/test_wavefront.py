@@ -248,3 +248,9 @@ def test_damaged_files_are_refused(change, message: str, tmp_path: Path) -> None
         optics.MeasuredPupil.from_zemax(path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
         optics.MeasuredPupil.from_zemax(tmp_path / "other.txt")
+
+
+@pytest.mark.parametrize("width", [50.0, 500.0])
+def test_a_width_in_millimetres_is_told_as_such(width: float) -> None:
+    with pytest.raises(ValueError, match=rf"did you mean {width:g} \* mm\?"):
+        optics.MeasuredPupil(torch.zeros(8, 8), width=width)
