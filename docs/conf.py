@@ -89,6 +89,8 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "reference_url": {},
     "thumbnail_size": (480, 336),
+    "capture_repr": ("_repr_html_", "__repr__"),
+    "ignore_repr_types": r"matplotlib\.|list|tuple|NoneType",
     "image_scrapers": ("matplotlib",),
     "reset_modules": ("matplotlib",),
     "write_computation_times": False,
