@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 import importlib.util
 import json
-import random
 import os
+import random
 import re
 import shlex
 import subprocess
@@ -157,7 +157,7 @@ def test_the_first_code_is_the_camera_of_the_picture() -> None:
 
 def test_the_first_code_has_fifteen_lines_and_the_training_twelve() -> None:
     assert code_lines(code_blocks(README, "python")[0]) <= 15
-    imports, training = code_blocks(page("start/training"), "python")[0].split("\n\n", 1)
+    _imports, training = code_blocks(page("start/training"), "python")[0].split("\n\n", 1)
     assert code_lines(training) <= 12
 
 

@@ -1,11 +1,11 @@
 """Turn kcam's docstrings into reStructuredText: their layout is that of style.md, for readers of the source.
 
-    Args:      name: what it is [unit]. other: ...     becomes a field for each parameter of the signature
-    Returns:   ...                                     a field
-    Raises:    ValueError for ...; TypeError for ...   a field for each class
-    Source:    ...                                     a paragraph with a bold head
-    indented lines between blank ones                  an equation as it is written
-    `name`                                             a link where the site knows the name, else code
+Args:      name: what it is [unit]. other: ...     becomes a field for each parameter of the signature
+Returns:   ...                                     a field
+Raises:    ValueError for ...; TypeError for ...   a field for each class
+Source:    ...                                     a paragraph with a bold head
+indented lines between blank ones                  an equation as it is written
+`name`                                             a link where the site knows the name, else code
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def public_names() -> dict[str, str]:
 
 
 def members(module_name: str) -> list[str]:
-    """Public names of a module: its `__all__`, or what is defined in it and documented; each in the first that has it."""
+    """Public names of a module: its `__all__`, or what it defines and documents; each in the first that has it."""
     module = importlib.import_module(module_name)
     if hasattr(module, "__all__"):
         named = [name for name in module.__all__ if name != "__version__"]

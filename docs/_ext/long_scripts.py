@@ -1,5 +1,5 @@
-"""Scripts that run for longer than twenty seconds: `make docs-all` runs them, and their pages are committed with the hash
-of the script, by which sphinx-gallery knows that it need not run them, and `check` that they are of this script.
+"""Scripts that run for longer than twenty seconds: `make docs-all` runs them, and their pages are committed with the
+hash of the script, by which sphinx-gallery knows that it need not run them, and `check` that they are of this script.
 """
 
 from __future__ import annotations

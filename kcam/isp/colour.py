@@ -217,8 +217,8 @@ class ColourMatrix(Stage):
     """Camera colours to linear sRGB, a perfect white to 1.0: `apply_colour_matrix`.
 
     Args:      matrix: (3,C), a tensor or rows; an nn.Parameter trains. None for `as_shot_colour_matrix`, fitted for the
-               context's filter and light. It counts on a white balanced signal, in which white is the exposure's share of
-               the well, 0.8: divide one from `fit_colour_matrix` by that. A signal of one channel becomes gray.
+               context's filter and light. It counts on a white balanced signal, in which white is the exposure's share
+               of the well, 0.8: divide one from `fit_colour_matrix` by that. A signal of one channel becomes gray.
     Raises:    TypeError, ValueError for a matrix that has not three rows.
 
     Example:

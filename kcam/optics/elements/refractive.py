@@ -68,8 +68,8 @@ class PlanoConvexLens(Element):
         glass: a name in `materials.GLASSES`, or a refractive index.
     Raises:  ValueError for R <= 0, R above 10 m (millimetres by mistake), an unknown glass, or (from `Lens`) an
         aperture that reaches R.
-    Valid paraxially at any f-number. Its spherical aberration is that of one spherical surface in the plane of the pupil:
-    exact rays through a real one of N-BK7, however thin, have 0.46 of it with the curved side to a distant object and
+    Valid paraxially at any f-number. Its spherical aberration is that of one surface in the plane of the pupil: exact
+    rays through a real one of N-BK7, however thin, have 0.46 of it with the curved side to a distant object and
     1.8 times with the flat one (Seidel). A `CompoundLens` has that.
     Source:  Goodman, Introduction to Fourier Optics, 3rd ed., section 5.1; thesis (3.7).
 
