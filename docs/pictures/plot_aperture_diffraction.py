@@ -18,8 +18,8 @@ from kcam import Camera, Scene, optics, plots
 from kcam.units import mm, nm, um
 
 scene, pitch = Scene.builtin("star", size=300), 2 * um
-fig, axes = plt.subplots(1, 4, figsize=(9, 2.8), layout="constrained")
-for ax, f_number in zip(axes, (4, 8, 16, 32), strict=True):
+fig, axes = plt.subplots(2, 2, figsize=(7, 7.4), layout="constrained")
+for ax, f_number in zip(axes.flat, (4, 8, 16, 32), strict=True):
     aperture = optics.CircularAperture(50 * mm / f_number)
     lens = optics.Lens(aperture, optics.ThinLens(50 * mm), focus_distance=2.0)
     camera = Camera(optics.Imaging(lens, pixel_pitch=pitch), *Camera.ideal())

@@ -22,12 +22,12 @@ best = math.sqrt(2.44 * 550 * nm * distance)
 assert round(best / um) == 82
 cases = {f"{d / um:.0f} µm": (optics.CircularAperture(d),) for d in (240 * um, best, 52 * um)}
 cases["lens of f/2"] = (optics.CircularAperture(2.5 * mm), optics.ThinLens(distance))
-fig, axes = plt.subplots(1, 4, figsize=(9, 2.8), layout="constrained")
-for ax, (name, elements) in zip(axes, cases.items(), strict=True):
+fig, axes = plt.subplots(2, 2, figsize=(7, 7.4), layout="constrained")
+for ax, (name, elements) in zip(axes.flat, cases.items(), strict=True):
     lens = optics.Lens(*elements, sensor_distance=distance)
     camera = Camera(optics.Imaging(lens, pixel_pitch=10 * um), *Camera.ideal())
     ax.imshow(plots.as_image(camera(scene.with_depth(float("inf")))[0]))
-    ax.set_title(f"{name}: {(lens.f_number / 2) ** 2:,.0f} times")
+    ax.set_title(f"{name}: {(lens.f_number / 2) ** 2:,.0f} ×")  # noqa: RUF001
     ax.axis("off")
 fig.suptitle("Three pinholes and a lens, and the exposure time that each needs")
 plt.show()

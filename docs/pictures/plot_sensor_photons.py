@@ -19,8 +19,8 @@ from kcam.isp import tone_curve
 
 scene, generator = Scene.builtin("astronaut", size=256), torch.Generator().manual_seed(0)
 linear = spectral.xyz_to_linear_srgb(scene.xyz())[0].clamp(0, 1)
-fig, axes = plt.subplots(1, 4, figsize=(9, 2.8), layout="constrained")
-for ax, photons in zip(axes, (1, 10, 100, 1000), strict=True):
+fig, axes = plt.subplots(2, 2, figsize=(7, 7.4), layout="constrained")
+for ax, photons in zip(axes.flat, (1, 10, 100, 1000), strict=True):
     counted = sensor.poisson(photons * linear, generator=generator)
     ax.imshow(plots.as_image(tone_curve(counted / photons)))
     white = sensor.poisson(torch.full((10_000,), float(photons)), generator=generator)
