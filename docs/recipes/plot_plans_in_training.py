@@ -10,7 +10,7 @@ measure what that saves, what it does to gradients, and how a plan says that it 
 # A camera to train
 # -----------------
 #
-# A lens that is focused at 1.3 m sees a portrait at 0.9 m. A diffractive element (DOE) of 64 x 64 pixels is to bring it
+# A lens that is focused at 1.3 m sees a portrait at 0.9 m. A diffractive element (DOE) of 48 x 48 pixels is to bring it
 # into focus, by a loss on the finished picture.
 
 import time
@@ -23,9 +23,9 @@ from kcam import Camera, Scene, isp, optics, plots, sensor
 from kcam.planner import OutOfRange, Planner, noiseless_raw
 from kcam.units import mm, nm, um
 
-phase = torch.nn.Parameter(0.1 * torch.randn(64, 64, generator=torch.Generator().manual_seed(0)))
+phase = torch.nn.Parameter(0.1 * torch.randn(48, 48, generator=torch.Generator().manual_seed(0)))
 lens = optics.Lens(
-    optics.CircularAperture(3 * mm), optics.ThinLens(20 * mm), optics.DOE(phase, design_wavelength=550 * nm),
+    optics.CircularAperture(2.5 * mm), optics.ThinLens(20 * mm), optics.DOE(phase, design_wavelength=550 * nm),
     focus_distance=1.3,
 )  # fmt: skip
 camera = Camera(
@@ -33,13 +33,17 @@ camera = Camera(
     sensor.Exposure(), sensor.ShotNoise(full_well=10_000), sensor.ReadNoise(3.0), sensor.ADC(bits=12),
     isp.Demosaic(), isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve(),
 )  # fmt: skip
-portrait = Scene.builtin("astronaut", size=(96, 96)).with_depth(0.9)
+portrait = Scene.builtin("astronaut", size=(80, 80)).with_depth(0.9)
 target = portrait.to_srgb()
 
 
-def loss_of(camera, seed=0):
-    """Mean square between the picture and what a perfect camera would show."""
-    picture = camera(portrait, generator=torch.Generator().manual_seed(seed))
+def picture_of(camera, seed=0):
+    """The portrait, with the noise of a seed."""
+    return camera(portrait, generator=torch.Generator().manual_seed(seed))
+
+
+def loss_of(picture):
+    """Mean square between a picture and what a perfect camera would show."""
     return (picture - target).square().mean()
 
 
@@ -60,7 +64,7 @@ print(plans[0.05])
 def gradient_and_time(camera):
     """d loss / d phase, and CPU seconds of the step."""
     start = time.process_time()
-    gradient = torch.autograd.grad(loss_of(camera), phase)[0]
+    gradient = torch.autograd.grad(loss_of(picture_of(camera)), phase)[0]
     return gradient, time.process_time() - start
 
 
@@ -87,21 +91,21 @@ for tolerance, plan in plans.items():
 plan = plans[0.05]
 planned = plan.apply(camera)
 with torch.no_grad():
-    before = camera(portrait, generator=torch.Generator().manual_seed(0))
+    before = picture_of(camera)
 optimiser = torch.optim.Adam([phase], lr=0.3)
 losses = []
 for step in range(30):
-    loss = loss_of(planned, seed=step)
+    loss = loss_of(picture_of(planned, seed=step))
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
     losses.append(loss.item())
 with torch.no_grad():
-    after = camera(portrait, generator=torch.Generator().manual_seed(0))  # all physics
-    full_loss = float(loss_of(camera))
+    after = picture_of(camera)  # all physics
+full_loss = float(loss_of(after))
 print(f"loss through the plan {losses[0]:.4f} to {losses[-1]:.4f}; by all physics {full_loss:.4f}")
 print(f"error of the raw after 30 steps: {plan.measure(camera, portrait):.4f}")
-assert full_loss < 0.5 * losses[0]
+assert full_loss < 0.6 * losses[0]
 
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")
 axes[0].plot(losses)
@@ -131,11 +135,11 @@ assert caught[0].category is OutOfRange
 # light far beyond the window that was enough for the first:
 
 with torch.no_grad():
-    phase.copy_(2 * torch.pi * torch.rand(64, 64, generator=torch.Generator().manual_seed(1)))
+    phase.copy_(2 * torch.pi * torch.rand(48, 48, generator=torch.Generator().manual_seed(1)))
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     for step in range(30, 50):
-        loss_of(planned, seed=step).backward()
+        loss_of(picture_of(planned, seed=step)).backward()
 assert [warning.category for warning in caught] == [OutOfRange]
 print(caught[0].message)
 
