@@ -17,16 +17,16 @@ import torch
 from kcam import optics, spectral
 from kcam.units import mm, um, wavelength_grid
 
-y, x = torch.meshgrid(torch.linspace(-1, 1, 256), torch.linspace(-1, 1, 256), indexing="ij")
+y, x = torch.meshgrid(*[torch.linspace(-1, 1, 256)] * 2, indexing="ij")
 angle, radius = torch.atan2(y, x), torch.hypot(x, y)
 
 
 def polygon(sides):
-    turn = 2 * math.pi / sides
-    return radius * torch.cos(torch.remainder(angle + math.pi / 2, turn) - turn / 2) < math.cos(turn / 2)
+    half = math.pi / sides
+    return radius * torch.cos(torch.remainder(angle + math.pi / 2, 2 * half) - half) < math.cos(half)
 
 
-u, v = 1.25 * x, -1.25 * y + 0.1
+u, v = 1.25 * x, 0.1 - 1.25 * y
 shapes = {
     "five blades": polygon(5),
     "six blades": polygon(6),
@@ -37,13 +37,12 @@ shapes = {
 }
 apertures = {"round": optics.CircularAperture(8 * mm), "mirror lens": optics.AnnularAperture(8 * mm, obscuration=0.5)}
 apertures |= {name: optics.ApertureMap(shape.float(), width=8 * mm) for name, shape in shapes.items()}
-
 bands = wavelength_grid(count=8)
 fig, axes = plt.subplots(2, 4, figsize=(8, 4.5), layout="constrained")
 for ax, (name, aperture) in zip(axes.flat, apertures.items(), strict=True):
     lens = optics.Lens(aperture, optics.ThinLens(50 * mm), focus_distance=2.0)
-    psf = lens.psf(bands, distances=0.8, pixel_pitch=4 * um, shape=(101, 101))[0]
-    xyz = torch.einsum("lhw,lc->chw", psf.double(), spectral.xyz_weights(bands, "D65"))
+    psf = lens.psf(bands, distances=0.8, pixel_pitch=4 * um, shape=(101, 101))[0].double()
+    xyz = torch.einsum("lhw,lc->chw", psf, spectral.xyz_weights(bands, "D65"))
     colours = spectral.xyz_to_linear_srgb(xyz).clamp(min=0)
     ax.imshow((colours / colours.quantile(0.998)).clamp(max=1).sqrt().permute(1, 2, 0).numpy())
     ax.set(title=name, xticks=[], yticks=[])

@@ -28,8 +28,7 @@ target /= target.sum()
 phase = torch.nn.Parameter(3 * torch.randn(96, 96, generator=torch.Generator().manual_seed(0)))
 elements = optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), optics.DOE(phase, design_wavelength=550 * nm)
 lens = optics.Lens(*elements, focus_distance=2.0)
-optimiser = torch.optim.Adam([phase], lr=0.2)
-losses = []
+optimiser, losses = torch.optim.Adam([phase], lr=0.2), []
 for _ in range(80):
     psf = lens.psf([550 * nm], distances=2.0, pixel_pitch=8 * um, shape=(65, 65))[0, 0]
     # of amplitudes, so that a few bright pixels do not count for all
