@@ -343,7 +343,7 @@ class Lens(ElementStack):
 
     def _check_f_number(self) -> None:
         (fastest, slowest), width = TESTED_F_NUMBERS, 2 * float(self.aperture.semi_aperture().detach())
-        if not fastest <= self.f_number <= slowest:
+        if not fastest * (1 - 1e-6) <= self.f_number <= slowest * (1 + 1e-6):  # f/100 is within, for all rounding
             limits = (width * self.f_number / number * 1e3 for number in (slowest, fastest))
             warnings.warn(
                 f"f/{self.f_number:.3g} is outside f/{fastest:g}..f/{slowest:g}, where PSFs were tested against "

@@ -16,6 +16,7 @@ from kcam.optics.compound.images import QUICK
 from kcam.optics.numerics import fast_length
 from kcam.optics.propagation import sampling
 from kcam.optics.rendering.resampling import resampling
+from kcam.optics.rendering.zones import Axis
 from kcam.optics.source import PixelGrid
 from kcam.units import mm, nm, um
 
@@ -437,3 +438,13 @@ def test_a_transform_that_is_just_long_enough(seed: int, monkeypatch: pytest.Mon
     usual = psf()
     monkeypatch.setattr(sampling, "points_per_pixel", lambda **_: per_pixel)
     assert float((psf() - usual).abs().sum()) < 2e-3
+
+
+def test_nodes_that_mirror_each_other_have_as_many_pixels() -> None:
+    """Of a node on a pixel rounding leaves 1e-17 of a share on one side, and its twin's zone was a pixel smaller."""
+    for n in range(20, 420, 7):
+        for apart in (17, 20, 23, 54, 64, 101):
+            axis = Axis.of(n, 31, apart=apart)
+            sizes = [last - first for first, last in map(axis.reach, range(len(axis.nodes)))]
+            assert sizes == sizes[::-1], (n, apart)
+            assert torch.allclose(axis.weights.sum(0), torch.ones(n + 30, dtype=DOUBLE), atol=1e-8)

@@ -8,7 +8,7 @@ import oracles
 import pytest
 import torch
 
-from kcam.optics import GLASSES, refractive_index
+from kcam.optics import GLASSES, Glass, refractive_index
 from kcam.units import nm, wavelength_grid
 
 PUBLISHED = oracles.sellmeier_published()
@@ -79,3 +79,9 @@ def test_the_default_bands_are_within_all_glasses_but_these() -> None:
 def test_wavelength_beyond_the_fit_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"wavelength 2600 nm is outside the Sellmeier range of N-BK7, 300\.\.2500 nm"):
         index("N-BK7", 550 * nm, 2600 * nm)
+
+
+def test_wavelengths_may_be_a_list() -> None:
+    for glass in ("N-BK7", Glass(1.5168, 64.2), 1.5):
+        listed = refractive_index(glass, wavelengths=[450e-9, 550e-9])
+        assert torch.equal(listed, refractive_index(glass, wavelengths=torch.tensor([450e-9, 550e-9]).double()))

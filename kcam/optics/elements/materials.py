@@ -183,7 +183,7 @@ GLASSES = {
 """Name -> dispersion: coefficients of its Sellmeier equation, the wavelengths [um] of the fit, and the source."""
 
 
-def refractive_index(glass: str | float | Glass, *, wavelengths: Tensor) -> Tensor:
+def refractive_index(glass: str | float | Glass, *, wavelengths: Tensor | list[float]) -> Tensor:
     """Refractive index at each wavelength by the glass's Sellmeier equation, or a constant index.
 
     n^2 = 1 + sum_i B_i lambda^2 / (lambda^2 - C_i)
@@ -199,6 +199,7 @@ def refractive_index(glass: str | float | Glass, *, wavelengths: Tensor) -> Tens
     >>> round(float(optics.refractive_index("N-BK7", wavelengths=torch.tensor([587.56 * nm]))), 4)
     1.5168
     """
+    wavelengths = torch.as_tensor(wavelengths)
     if isinstance(glass, Glass):
         return glass.index(wavelengths)
     if not isinstance(glass, str):

@@ -20,6 +20,7 @@ from kcam.optics.autograd import add_at, cut
 from kcam.optics.numerics import linear_weights
 from kcam.optics.rendering.borders import extend
 
+_NOTHING = 1e-9  # of a share
 Bank = Callable[[Tensor], Iterable[Tensor]]
 """PSFs (Z, G, h, w) of places (N, 2), x and y in pixels from the picture's middle, as the upright picture has it."""
 Render = Callable[..., Tensor]
@@ -44,6 +45,7 @@ class Axis:
         nodes = torch.linspace(-end, end, count, dtype=torch.float64)
         at = torch.arange(-(window // 2), n + (window - 1) // 2, dtype=torch.float64) - (n - 1) / 2
         weights = linear_weights(nodes, at).T
+        weights[weights < _NOTHING] = 0  # of a node on a pixel, rounding leaves some on one side, and not on its twin's
         own = [row.nonzero()[:, 0] for row in weights]
         return cls(nodes, weights, [int(pixels[0]) for pixels in own], [int(pixels[-1]) + 1 for pixels in own])
 
