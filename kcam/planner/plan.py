@@ -372,7 +372,8 @@ class PlannedCamera(Camera):
         unplanned: Sequence[nn.Parameter] = (),
     ) -> None:
         super().__init__(*stages, context=context)
-        self.plan_applied, self.unplanned, self._steps = plan, tuple(unplanned), 0
+        self.plan_applied, self.unplanned = plan, tuple(unplanned)
+        self._steps = [0]  # of training; one count for this camera and its parts
         self._whole = (whole,)  # not a module of its own: its parameters are known already
 
     @property
@@ -392,12 +393,12 @@ class PlannedCamera(Camera):
                 stacklevel=3,
             )
         if torch.is_grad_enabled():
-            self._steps += 1
-            if isinstance(scene, Scene) and self._steps % EACH == 0 and len(scene.coefficients):
+            self._steps[0] += 1
+            if isinstance(scene, Scene) and self._steps[0] % EACH == 0 and len(scene.coefficients):
                 error = plan.measure(self.whole, scene.samples([0]))
                 if error > plan.allowed:
                     warnings.warn(
-                        f"after {self._steps} steps of training the plan is off by {error:.2g}, more than the "
+                        f"after {self._steps[0]} steps of training the plan is off by {error:.2g}, more than the "
                         f"tolerance of {plan.allowed:g}. Plan anew for what it has become: plan.renew(camera, scenes).",
                         OutOfRange,
                         stacklevel=3,
@@ -419,6 +420,22 @@ class PlannedCamera(Camera):
                     stacklevel=3,
                 )
         return super().steps(scene, generator=generator)
+
+    def noiseless(self) -> Camera:
+        """As `Camera.noiseless`; it warns as this camera does."""
+        return self._like(super().noiseless())
+
+    def __getitem__(self, key: int | slice) -> Any:
+        part = super().__getitem__(key)
+        return self._like(part) if isinstance(key, slice) and key.start in (None, 0) else part
+
+    def _like(self, camera: Camera) -> PlannedCamera:
+        """A camera from the scene on, such as `raw` takes, under the same plan."""
+        found = PlannedCamera(
+            *camera, plan=self.plan_applied, whole=self.whole, context=camera.context, unplanned=self.unplanned
+        )
+        found._steps = self._steps
+        return found
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write it as a plain camera that has the plan's choices."""

@@ -767,3 +767,34 @@ def test_a_plan_is_renewed_as_it_was_made() -> None:
     again = plan.renew(camera(), scene())
     assert not again.gradients
     assert (again.tolerance, again.changes) == (plan.tolerance, plan.changes)
+
+
+PARTS = {
+    "raw": lambda camera: camera.raw,
+    "the first stages": lambda camera: camera[:4],
+    "noiseless": lambda camera: camera.noiseless(),
+    "the raw of noiseless": lambda camera: camera.noiseless().raw,
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_parts_of_a_planned_camera_warn_as_it_does(part: str) -> None:
+    camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)
+    with torch.no_grad():
+        shot = PARTS[part](camera.plan(scene, tolerance=0.05).apply(camera))
+        shot(scene)
+        with pytest.warns(OutOfRange, match="0.3"):
+            shot(scene.with_depth(0.3))
+
+
+def test_steps_of_training_on_the_raw_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kcam.planner.plan.EACH", 3)
+    camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)
+    short = camera.plan(scene, tolerance=0.05).apply(camera)
+    asked: list[Scene] = []
+    monkeypatch.setattr(Plan, "measure", lambda self, camera, scene: asked.append(scene) or 1.0)
+    short.raw(scene)
+    short(scene)
+    with pytest.warns(OutOfRange, match="after 3 steps"):
+        short.raw(scene)
+    assert len(asked) == 1
