@@ -95,12 +95,22 @@ class Converter:
 
     def __init__(self) -> None:
         self.names = public_names()
+        self.full = set(self.names.values()) | {f"{module}.{name}" for module in MODULES for name in members(module)}
 
-    def code(self, text: str) -> str:
+    def find(self, word: str, place: str) -> str | None:
+        """The full name of a word, as one means it there: first what belongs to the same class or module."""
+        word = word.removesuffix("()")
+        while place:
+            if f"{place}.{word}" in self.full:
+                return f"{place}.{word}"
+            place = place.rpartition(".")[0]
+        return self.names.get(word.removeprefix("kcam."))
+
+    def code(self, text: str, place: str = "") -> str:
         """Single backticks: a link to a public name, or code."""
 
         def one(match: re.Match[str]) -> str:
-            full = self.names.get(match[1].removeprefix("kcam.").removesuffix("()"))
+            full = self.find(match[1], place)
             return f":py:obj:`{match[1]} <{full}>`" if full else f"``{match[1]}``"
 
         parts, end = [], 0
@@ -109,8 +119,8 @@ class Converter:
             end = literal.end()
         return "".join(parts) + CODE.sub(one, _escaped(text[end:]))
 
-    def convert(self, lines: list[str], parameters: list[str]) -> list[str]:
-        """The lines of one docstring."""
+    def convert(self, lines: list[str], parameters: list[str], place: str = "") -> list[str]:
+        """The lines of one docstring of what has that full name."""
         result: list[str] = []
         fields: list[str] = []
         index = 0
@@ -125,7 +135,7 @@ class Converter:
                 while index + 1 < len(lines) and lines[index + 1].startswith(" "):
                     index += 1
                     body.append(lines[index])
-                fields += list(self._field(head[1], body, parameters))
+                fields += list(self._field(head[1], body, parameters, place))
             elif line.startswith("    ") and (not result or not result[-1].strip()):
                 block = [line]
                 while index + 1 < len(lines) and (lines[index + 1].startswith("    ") or not lines[index + 1].strip()):
@@ -136,15 +146,15 @@ class Converter:
                 while line.strip() and index + 1 < len(lines) and lines[index + 1].startswith("  "):
                     index += 1  # a head of its own: "Fields: ..." goes on indented
                     line = f"{line} {lines[index].strip()}"
-                result.append(self.code(line))
+                result.append(self.code(line, place))
             index += 1
         if fields:
             at = next((i for i, line in enumerate(result) if line == ".. rubric:: Example"), len(result))
             result[at:at] = ["", *fields, ""]
         return result
 
-    def _field(self, head: str, body: list[str], parameters: list[str]) -> Iterator[str]:
-        text = self.code(" ".join(line.strip() for line in body if line.strip()))
+    def _field(self, head: str, body: list[str], parameters: list[str], place: str) -> Iterator[str]:
+        text = self.code(" ".join(line.strip() for line in body if line.strip()), place)
         if head in ("Args", "Arguments"):
             yield from _parameters(text, parameters)
         elif head in ("Returns", "Yields"):
@@ -212,7 +222,7 @@ def setup(app: Any) -> dict[str, bool]:
             parameters = list(inspect.signature(value).parameters)
         except (TypeError, ValueError):
             parameters = []
-        lines[:] = converter.convert(lines, parameters)
+        lines[:] = converter.convert(lines, parameters, name)
 
     app.connect("autodoc-process-docstring", process)
     return {"parallel_read_safe": True}

@@ -219,13 +219,14 @@ def extract(
     except StoreError as error:
         usage(str(error))
     if dry_run:
-        splits = Counter(job.split for job in plan.scenes)
+        found = Counter(job.split for job in plan.scenes)
+        splits = {name: found[name] for name, _ in settings.split}  # those that stay empty too
         result: dict[str, Any] = {
             "scenes": len(plan.scenes),
             "patches": plan.most_patches,
             "bytes": plan.most_bytes,
             "seconds": plan.most_bytes / RATE / workers,
-            "splits": dict(splits),
+            "splits": splits,
             "plan": plan.hash,
         }
         lines = [

@@ -212,7 +212,10 @@ def _finish(plan: StorePlan, out: Path, outcome: Outcome) -> None:
     for name, _ in plan.settings.split:
         own = [record for record in records if record["split"] == name]
         if not own:
-            outcome.warnings.append(f"the split {name} received no scene: there are too few groups for its share.")
+            outcome.warnings.append(
+                f"the split {name} received no scene: there are too few groups for its share. "
+                "Try other shares, such as 0.5/0.5: --dry-run shows what they give."
+            )
         elif not any(record["count"] for record in own):
             outcome.warnings.append(f"the split {name} has no patch: the filters left out all of them.")
         folder = out / name
