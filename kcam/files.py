@@ -390,6 +390,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The configuration and the tensors in a file; the tensors do not depend on the file any more."""
     if not path.is_file():
         what = f"{path} is a folder. Name the file in it" if path.is_dir() else f"there is no file {path}"
+        run = path if path.is_dir() else path.with_suffix("")
+        if (run / "checkpoints").is_dir():  # of `kcam train`, whose last act is to write the camera
+            what = f"{path} is no camera yet: its training was stopped. Go on with the same kcam train ... --resume"
         raise FileNotFoundError(f"{what}.")
     try:
         with safe_open(path, framework="pt") as file:

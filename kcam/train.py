@@ -262,10 +262,10 @@ def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> No
     if not resume:
         raise ValueError(f"{folder} holds a run. Go on with --resume, choose another --out, or remove the folder.")
     for name, value in document["options"].items():
-        if name != "out" and there["options"].get(name) != value:
-            raise ValueError(
-                f"{folder} was begun with {name} = {there['options'].get(name)!r}, not {value!r}. Use the same options."
-            )
+        begun = there["options"].get(name)
+        if name != "out" and begun != value:
+            told = f"without --{name.replace('_', '-')}" if begun is None else f"with {name} = {begun!r}"
+            raise ValueError(f"{folder} was begun {told}, not {value!r}. Use the same options.")
     if there["style"] != document["style"]:
         raise ValueError(f"{document['options']['style']} is not the picture that {folder} was begun with.")
     if there.get("photos") != document.get("photos"):

@@ -217,6 +217,13 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
         restore(tmp_path / "x.safetensors")
 
 
+@pytest.mark.parametrize("name", ["painter", "painter.safetensors"])
+def test_a_training_that_was_stopped_is_no_camera_yet(name: str, tmp_path: Path) -> None:
+    (tmp_path / "painter" / "checkpoints").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match=f"{name} is no camera yet: its training was stopped. Go on with"):
+        restore(tmp_path / name)
+
+
 def test_no_folder(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="cannot save x.safetensors: there is no folder .*nowhere"):
         store(Gain(1.0), tmp_path / "nowhere" / "x.safetensors")

@@ -102,6 +102,8 @@ def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None
         run(out)
     with pytest.raises(ValueError, match=r"was begun with seed = 0, not 1. Use the same options"):
         run(out, resume=True, seed=1)
+    with pytest.raises(ValueError, match=r"was begun without --style-size, not 64. Use the same options"):
+        run(out, resume=True, style_size=64)
     picture = tmp_path / "style.png"
     plots.write_picture(painting("woodcut", size=128), picture)
     out = tmp_path / "b.safetensors"
