@@ -3,7 +3,7 @@
     python -m benchmarks.style [--styles strokes,..] [--arms optics,..] [--work .style-bench]     train and measure
     python -m benchmarks.style --styles strokes --arms stage --seeds 1,2                        again, by other seeds
     python -m benchmarks.style --collect                                                        write what is committed
-    python -m benchmarks.style --paint                                                          docs/painted.jpg
+    python -m benchmarks.style --paint                                                          docs/images/painted.jpg
 
 Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting, or of all of it, as
 `kcam train` does; it is measured on three other photographs of 256 pixels, against the ordinary camera's picture and a
@@ -274,7 +274,7 @@ def collect(work: Path) -> None:
         ),
     }
     for name, figure in sheets.items():
-        save_jpeg(figure, ROOT / "docs" / f"{name}.jpg", **BULKY)
+        save_jpeg(figure, ROOT / "docs" / "images" / f"{name}.jpg", **BULKY)
     print(RESULT, *sheets)
 
 
@@ -292,7 +292,7 @@ def paint_pictures() -> None:
         titles=["Style", "Texture, from white noise", "Painting, from the photo"],
         labels=list(STYLES),
     )
-    save_jpeg(sheet, ROOT / "docs" / "painted.jpg", **BULKY)
+    save_jpeg(sheet, ROOT / "docs" / "images" / "painted.jpg", **BULKY)
 
 
 if __name__ == "__main__":

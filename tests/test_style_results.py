@@ -13,7 +13,7 @@ from kcam.style import STYLES
 
 ROOT = Path(__file__).parents[1]
 ALL = json.loads((ROOT / "benchmarks" / "results" / "style.json").read_text())["rows"]
-DOCS = (ROOT / "docs" / "style.md").read_text()
+DOCS = (ROOT / "docs" / "understand" / "style.md").read_text()
 ROWS = [row for row in ALL if row["seed"] == 0]
 AGAIN = [row for row in ALL if row["seed"]]
 
@@ -91,4 +91,4 @@ def test_no_shot_is_a_wallpaper(style: str) -> None:
 
 @pytest.mark.parametrize("name", ["style", "style-parts", "style-thesis", "painted"])
 def test_pictures_are_of_readme_size(name: str) -> None:
-    assert 50_000 < (ROOT / "docs" / f"{name}.jpg").stat().st_size < 700_000
+    assert 50_000 < (ROOT / "docs" / "images" / f"{name}.jpg").stat().st_size < 700_000

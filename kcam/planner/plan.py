@@ -373,7 +373,7 @@ class PlannedCamera(Camera):
     ) -> None:
         super().__init__(*stages, context=context)
         self.plan_applied, self.unplanned = plan, tuple(unplanned)
-        self._steps = [0]  # of training; one count for this camera and its parts
+        self._trained = [0]  # of training; one count for this camera and its parts
         self._whole = (whole,)  # not a module of its own: its parameters are known already
 
     @property
@@ -393,12 +393,12 @@ class PlannedCamera(Camera):
                 stacklevel=3,
             )
         if torch.is_grad_enabled():
-            self._steps[0] += 1
-            if isinstance(scene, Scene) and self._steps[0] % EACH == 0 and len(scene.coefficients):
+            self._trained[0] += 1
+            if isinstance(scene, Scene) and self._trained[0] % EACH == 0 and len(scene.coefficients):
                 error = plan.measure(self.whole, scene.samples([0]))
                 if error > plan.allowed:
                     warnings.warn(
-                        f"after {self._steps[0]} steps of training the plan is off by {error:.2g}, more than the "
+                        f"after {self._trained[0]} steps of training the plan is off by {error:.2g}, more than the "
                         f"tolerance of {plan.allowed:g}. Plan anew for what it has become: plan.renew(camera, scenes).",
                         OutOfRange,
                         stacklevel=3,
@@ -434,7 +434,7 @@ class PlannedCamera(Camera):
         found = PlannedCamera(
             *camera, plan=self.plan_applied, whole=self.whole, context=camera.context, unplanned=self.unplanned
         )
-        found._steps = self._steps
+        found._trained = self._trained
         return found
 
     def save(self, path: str | PathLike[str]) -> None:
