@@ -40,6 +40,7 @@ import kcam.augmentation as KC  # noqa: E402
 from benchmarks.common import save_jpeg  # noqa: E402
 from kcam import Camera, Plan, Scene, demo, isp, optics, plots, sensor  # noqa: E402
 from kcam.data import FORMATS  # noqa: E402
+from kcam.optics.compound.presets import PRESETS  # noqa: E402
 from kcam.optics.propagation.question import Query  # noqa: E402
 from kcam.optics.propagation.table import choose  # noqa: E402
 from kcam.tradeoff import Row, Sweep  # noqa: E402
@@ -787,6 +788,18 @@ def glasses_table() -> str:
     return "\n".join(lines)
 
 
+def lenses_table() -> str:
+    """`CompoundLens.preset`: what each is, and whose."""
+    lines = ["| `CompoundLens.preset(...)` | f [mm] | f-number | field, Y / D | from |", "|---|---:|---:|---:|---|"]
+    for name, prescription in sorted(PRESETS.items()):
+        lens = optics.CompoundLens.preset(name)
+        lines.append(
+            f"| `{name}` | {float(lens.focal_length()) / mm:.3g} | {float(lens.f_number):.2g} | {prescription.field:g} | "
+            f"{prescription.source} |"
+        )
+    return "\n".join(lines)
+
+
 def mosaics_table() -> str:
     """`sensor.PATTERNS`."""
     lines = ["| `sensor.Mosaic(...)` | tile | rows |", "|---|---|---|"]
@@ -846,6 +859,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "segmentation": segmentation_table,
     "formats": formats_table,
     "glasses": glasses_table,
+    "lenses": lenses_table,
     "mosaics": mosaics_table,
     "demosaics": demosaics_table,
     "commands": command_line,

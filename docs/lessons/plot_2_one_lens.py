@@ -129,7 +129,8 @@ ax.legend(frameon=False)
 # ------------------------------------------
 #
 # A picture is the scene convolved with the PSF, so fine stripes lose contrast by its Fourier transform. Its modulus,
-# the MTF, is known in closed form for a perfect round lens. It is zero beyond the cutoff :math:`1 / \lambda N`:
+# the MTF, is known in closed form for a perfect round lens (paraxially: for lenses faster than f/8 say
+# :math:`N \sqrt{1 + 1 / 4 N^2}` for :math:`N`). It is zero beyond the cutoff :math:`1 / \lambda N`:
 #
 # .. math:: \mathrm{MTF}(\nu) = \frac{2}{\pi}\left(\arccos \nu - \nu \sqrt{1 - \nu^2}\right), \qquad
 #           \nu = \lambda N \cdot \text{frequency}
