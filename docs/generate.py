@@ -794,8 +794,8 @@ def lenses_table() -> str:
     for name, prescription in sorted(PRESETS.items()):
         lens = optics.CompoundLens.preset(name)
         lines.append(
-            f"| `{name}` | {float(lens.focal_length()) / mm:.3g} | {float(lens.f_number):.2g} | {prescription.field:g} | "
-            f"{prescription.source} |"
+            f"| `{name}` | {float(lens.focal_length()) / mm:.3g} | {float(lens.f_number):.2g} | "
+            f"{prescription.field:g} | {prescription.source} |"
         )
     return "\n".join(lines)
 
