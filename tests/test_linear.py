@@ -116,9 +116,12 @@ CASES = {
     "measured at places": Case(through(lambda: optics.Imaging(measured(places=True), pixel_pitch=4 * um))),
     "convolution": Case(lambda: Camera(singlet(), *behind(None)[:-1], isp.Convolution(), isp.Demosaic())),
     "field": Case(through(over_the_field)),
-    "field with depth": Case(through(over_the_field), mapped),
 } | {border: Case(through(lambda border=border: singlet(border=border)), mapped) for border in BORDERS}
-SLOW = {"thesis": Case(Camera.thesis), "slr": Case(Camera.slr)}
+SLOW = {
+    "thesis": Case(Camera.thesis),
+    "slr": Case(Camera.slr),
+    "field with depth": Case(through(over_the_field), mapped),
+}
 
 
 def lights() -> Tensor:
@@ -210,7 +213,7 @@ def test_random_cameras_are_linear_and_transposed(seed: int, dtype: torch.dtype)
     assert abs(products[0] - products[1]) < ROUNDING[dtype] * raw.double().norm() * y.double().norm()
 
 
-@pytest.mark.parametrize("name", ["singlet", "depth", "measured at places", "field", "field with depth"])
+@pytest.mark.parametrize("name", ["singlet", "depth", "measured at places", "field"])
 @torch.no_grad()
 def test_one_scene_stands_for_all_of_a_batch(name: str) -> None:
     *_, operator, draw = made(name, torch.float64)
