@@ -258,7 +258,7 @@ def numbers(figure: Figure, name: str) -> list[tuple[float, float]]:
     return [(float(match[1]), float(match[2])) for match in found if match]
 
 
-@pytest.mark.parametrize("count", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 5))])
 def test_compare_shows_all_cameras(count: int) -> None:
     names = ["phone", "ideal", "a name that is much too long for the column in which it shall stand", "$x^", "thesis"]
     makes = [Camera.phone, Camera.ideal, mono, Camera.phone, Camera.thesis]
