@@ -2,9 +2,8 @@
 Two processes, one training
 ===========================
 
-``torchrun`` starts one process for each GPU, or here two on the CPU, and ``DistributedDataParallel`` averages their
-gradients. A camera trains in it like any other module, and two processes with a picture each take the same steps as
-one process with both.
+``torchrun`` starts one process for each GPU, or here two on the CPU, and they average their gradients. Two processes
+with a picture each take the same steps as one process with both.
 """
 
 # %%
@@ -36,7 +35,6 @@ import sys
 
 import torch
 from torch import distributed
-from torch.nn.parallel import DistributedDataParallel
 
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.units import mm, nm, um, wavelength_grid
@@ -60,7 +58,6 @@ def main(path, steps=6):
     camera = build()
     if world > 1:
         distributed.init_process_group("gloo")  # "nccl" on GPUs
-        camera = DistributedDataParallel(camera)
     names = ("astronaut", "chelsea")
     scenes = [Scene.builtin(name, size=(64, 64), wavelengths=wavelength_grid(count=12)) for name in names]
     scenes = [scene.with_depth(0.8) for scene in scenes]
@@ -74,12 +71,14 @@ def main(path, steps=6):
             picture = camera(scenes[index], generator=noise)
             loss = loss + (picture - scenes[index].to_srgb()).square().mean() / len(own)
         optimiser.zero_grad()
-        loss.backward()  # here DistributedDataParallel averages the gradients
-        optimiser.step()
+        loss.backward()
         mean = loss.detach().clone()
         if world > 1:
-            distributed.all_reduce(mean)  # a sum
-        losses.append(float(mean) / world)
+            for value in (mean, *(parameter.grad for parameter in camera.parameters())):
+                distributed.all_reduce(value)  # a sum
+                value /= world
+        optimiser.step()
+        losses.append(float(mean))
     if rank == 0:  # one process writes
         with open(path, "w") as file:
             json.dump({"processes": world, "losses": losses}, file)
@@ -128,6 +127,10 @@ ax.set(title="The loss at each step", xlabel="step", ylabel="mean square error",
 ax.legend(frameon=False)
 
 # %%
+# ``torch.nn.parallel.DistributedDataParallel(camera)`` averages the gradients too, while the backward pass still runs,
+# which pays on GPUs. On a CPU the threads of ``gloo`` that it started run on until the process ends (torch 2.13), and
+# one run of this page was aborted there; those of the loop above end with ``destroy_process_group``.
+#
 # The first loss is the same to rounding. After that rounding may grow: a sum in another order differs in its last bit,
 # and then somewhere a photon more or less is counted, which is a step and no rounding.
 #
