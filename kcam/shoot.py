@@ -12,6 +12,7 @@ import torch
 
 from kcam import files, optics, plots
 from kcam.camera import Camera
+from kcam.data.photos import PICTURES, files_in
 from kcam.planner import Plan
 from kcam.planner import shoot as within
 from kcam.scene import Scene
@@ -23,19 +24,18 @@ def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     Raises:    FileNotFoundError, ValueError for a photo that is not there, a folder without pictures, two photos of one
                name, or a name that cannot be written, before anything is taken.
     """
-    known = plots.PICTURE_SUFFIXES
     found: list[Path] = []
     for photo in photos:
-        inside = _pictures(photo) if photo.is_dir() else [photo]
+        inside = files_in(photo, below=False) if photo.is_dir() else [photo]
         if not inside:
-            raise ValueError(f"there is no picture in the folder {photo}: expected {', '.join(known)}.")
+            raise ValueError(f"there is no picture in the folder {photo}: expected {', '.join(PICTURES)}.")
         found += inside
     single = len(found) == 1 and not photos[0].is_dir() and not out.is_dir() and out.suffix != ""
     if single:
         plots.check_writable(out)
         pairs = [(found[0], out)]
     else:
-        if out.suffix.lower() in known and not out.is_dir():
+        if out.suffix.lower() in plots.PICTURE_SUFFIXES and not out.is_dir():
             raise ValueError(f"{len(found)} photos do not fit into the one file {out}. Name a folder: --out shots/.")
         if out.exists() and not out.is_dir():
             raise ValueError(f"{out} is a file, and {len(found)} photos need a folder. Use --out shots/.")
@@ -52,12 +52,6 @@ def outputs(photos: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
             raise FileNotFoundError(f"there is no file {photo}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
         files.check_other(target, photo)
     return pairs
-
-
-def _pictures(folder: Path) -> list[Path]:
-    """Those in a folder, by name; not what is hidden: some systems keep a file of notes beside each, ._photo.jpg."""
-    names = (path for path in folder.iterdir() if path.suffix.lower() in plots.PICTURE_SUFFIXES)
-    return sorted(path for path in names if path.is_file() and not path.name.startswith("."))
 
 
 def shoot(

@@ -115,7 +115,7 @@ class PhotoDataset(Dataset[Photo]):
         self.size, self.seed = size, seed
         self.crop = None if crop is None else _window(crop)
         self.skipped: list[str] = []
-        pictures = _files(self.folder, PICTURES, but=self.depth_folder)
+        pictures = files_in(self.folder, but=self.depth_folder)
         if not pictures:
             raise ValueError(f"there is no picture in the folder {self.folder}: expected {', '.join(PICTURES)}.")
         maps: list[Path | None] = [None] * len(pictures)
@@ -338,8 +338,13 @@ def _folder(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _files(folder: Path, suffixes: Sequence[str], *, but: Path | None = None) -> list[Path]:
-    """Those in a folder and below it, in natural order; not what is hidden, nor what lies in `but`."""
+def files_in(
+    folder: Path, suffixes: Sequence[str] = PICTURES, *, below: bool = True, but: Path | None = None
+) -> list[Path]:
+    """Those in a folder, and in the folders below it, in natural order; not what is hidden, nor what lies in `but`.
+
+    Some systems keep a file of notes beside each picture, ._photo.jpg: it is hidden.
+    """
     found: list[Path] = []
     entered = set() if but is None else {but.resolve()}
 
@@ -351,7 +356,8 @@ def _files(folder: Path, suffixes: Sequence[str], *, but: Path | None = None) ->
             if child.name.startswith(".") or child.name == "__MACOSX":
                 continue
             if child.is_dir():
-                enter(child)
+                if below:
+                    enter(child)
             elif child.suffix.lower() in suffixes and child.is_file():
                 found.append(child)
 
@@ -368,7 +374,7 @@ def _natural(name: str) -> tuple[list[Any], str]:
 def _maps(folder: Path, pictures: Sequence[Path], depth_folder: Path) -> list[Path | None]:
     """The depth map of each picture, None where there is none. Raises: ValueError for two."""
     by_place, by_stem = defaultdict(list), defaultdict(list)
-    for path in _files(depth_folder, DEPTH_MAPS, but=folder):
+    for path in files_in(depth_folder, DEPTH_MAPS, but=folder):
         by_place[path.relative_to(depth_folder).with_suffix("")].append(path)
         by_stem[path.stem].append(path)
     stems = Counter({path.relative_to(folder).with_suffix("") for path in pictures})

@@ -21,7 +21,7 @@ from torch import Tensor
 from kcam import spectral
 from kcam.data import PatchDataset
 from kcam.data.patches.plan import fingerprint
-from kcam.data.photos import PICTURES
+from kcam.data.photos import PICTURES, files_in
 from kcam.scene import PHOTOGRAPHS, Scene, read_picture
 from kcam.style.generators import philox
 
@@ -232,24 +232,14 @@ class PhotoScenes:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    """The picture files of a folder and the folders in it, sorted, without those that are hidden."""
+    """The picture files of a folder and the folders in it."""
     if not folder.is_dir():
         if folder.exists():
             raise NotADirectoryError(f"{folder} is a file. Expected a folder of photographs.")
         raise FileNotFoundError(f"there is no folder {folder}. Expected one of photographs.")
-    found: list[Path] = []
-    others = 0
-    for inside, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in sorted(names):
-            path = Path(inside, name)
-            if name.startswith(".") or not path.is_file():
-                continue
-            if path.suffix.lower() in PICTURES:
-                found.append(path)
-            else:
-                others += 1
+    found = files_in(folder)
     if not found:
+        others = sum(path.is_file() and not path.name.startswith(".") for path in folder.rglob("*"))
         more = f", and there are {others} other files" if others else ""
         raise ValueError(f"there is no picture in the folder {folder}: expected {', '.join(PICTURES)}{more}.")
     return found
@@ -263,7 +253,7 @@ def _sides(longest: int, shortest: int, size: int) -> list[int]:
 
 
 class PatchScenes:
-    """Patches of a store that `data_tools/extract_patches.py` wrote, 2 m away; on reflectances daylight falls.
+    """Patches of a store that `kcam data extract` wrote, 2 m away; on reflectances daylight falls.
 
     Half of them are mirrored, and half lit by up to 3 stops less, by a light up to 1.5 stops bluer or redder.
 
@@ -283,7 +273,7 @@ class PatchScenes:
     def __init__(self, patches: str | os.PathLike[str] | PatchDataset, *, size: int | None = None) -> None:
         self.patches: Any = patches if isinstance(patches, PatchDataset) else PatchDataset(_split(patches))
         if not len(self.patches):
-            raise ValueError(f"{self.patches.folder} holds no patches. Extract some: data_tools/extract_patches.py.")
+            raise ValueError(f"{self.patches.folder} holds no patches. Extract some: kcam data extract.")
         height, width = self.patches[0].values.shape[1:]
         self.size = min(height, width) if size is None else size
         if self.size > min(height, width):
