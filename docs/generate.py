@@ -920,7 +920,9 @@ def overview(path: Path) -> None:
     """A scene, the lens's PSFs, the raw mosaic and the picture, each with a detail."""
     camera, scene = demo.singlet(), Scene.builtin("motorcycle")
     with torch.no_grad():
-        _, raw, picture = demo.shoot(camera, scene)
+        generator = torch.Generator().manual_seed(0)
+        raw = camera.raw(scene, generator=generator)
+        picture = camera(scene, generator=generator.manual_seed(0))
         psf = camera[0].lens.psf(COLOURS, distances=DISTANCES, pixel_pitch=4 * um, shape=(41, 41)).double()
     _, height, width = scene.shape
     side, gap, edge, head = 2.12, 0.08, 0.02, 0.26

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from kcam import isp, optics, plots, sensor
-from kcam.camera import DEMOSAICING, Camera
+from kcam.camera import Camera
 from kcam.scene import Scene
 from kcam.units import mm, nm, um
 
@@ -78,7 +77,7 @@ def run(
     with torch.no_grad():
         for scene_name, (scene_title, zoom) in SCENES.items():
             scene = Scene.builtin(scene_name, size=size)
-            if not isinstance(scene.depth, Tensor):
+            if not isinstance(scene.depth, torch.Tensor):
                 scene = scene.with_depth(DISTANCE)
             rows.append([scene.to_srgb()[0]])
             for name, camera in cameras.items():
@@ -103,11 +102,3 @@ def run(
         plots.save_figure(sheet, paths[0])
         advance("overview")
     return paths
-
-
-def shoot(camera: Camera, scene: Scene, *, seed: int = 0) -> tuple[list[tuple[str, float]], Tensor, Tensor]:
-    """Take a picture; returns (stage, seconds) for each stage, the raw signal (empty if none), and the picture."""
-    taken = list(plots.steps(camera, scene, generator=torch.Generator().manual_seed(seed)))
-    at = next((n for n, step in enumerate(taken) if isinstance(step.stages[0], DEMOSAICING)), 0)
-    raw = taken[at - 1].signal if at else torch.empty(0)
-    return [(step.name, step.seconds) for step in taken], raw, taken[-1].signal

@@ -231,5 +231,5 @@ def test_no_store(tmp_path: Path) -> None:
 
 def test_an_empty_store(tmp_path: Path) -> None:
     store = make_store(make_cubes(tmp_path / "cubes", ("apple",)), tmp_path / "store")
-    with pytest.raises(ValueError, match="val holds no patches. Extract some: data_tools/extract_patches.py"):
+    with pytest.raises(ValueError, match="val holds no patches. Extract some: kcam data extract"):
         PatchScenes(store / "val")
