@@ -28,11 +28,9 @@ extensions = [
 exclude_patterns = ["_build", "lessons", "recipes", "pictures", "**/GALLERY_HEADER.rst", "**.ipynb", "**.py", "**.md5"]
 templates_path = ["_templates"]
 default_role = "code"
-nitpicky = False
 
 # ---- pages -----------------------------------------------------------------------------------------------------------
 
-source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
 myst_enable_extensions = ["dollarmath", "colon_fence", "attrs_block", "attrs_inline"]
 myst_heading_anchors = 3
 bibtex_bibfiles = ["references.bib"]
@@ -42,7 +40,6 @@ copybutton_prompt_is_regexp = True
 
 # ---- the reference ---------------------------------------------------------------------------------------------------
 
-autosummary_generate = True
 autosummary_ignore_module_all = False
 autosummary_imported_members = True
 autodoc_typehints = "description"
@@ -51,7 +48,7 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
-doctest_test_doctest_blocks = ""  # tests/test_docstrings.py and tests/test_site.py run them
+doctest_test_doctest_blocks = ""  # tests/test_docstrings.py and tests/test_pages.py run them
 REACHED = {
     "python": ("docs.python.org", "https://docs.python.org/3/"),
     "torch": ("docs.pytorch.org", "https://docs.pytorch.org/docs/stable/"),
@@ -77,21 +74,15 @@ GALLERIES = {"lessons": "learn", "recipes": "do/recipes", "pictures": "gallery"}
 sphinx_gallery_conf = {
     "examples_dirs": [*GALLERIES],
     "gallery_dirs": [*GALLERIES.values()],
-    "filename_pattern": r"plot_",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
     "remove_config_comments": True,
     "abort_on_example_error": True,
-    "only_warn_on_example_error": False,
-    "plot_gallery": "True",
     "min_reported_time": 20,
-    "matplotlib_animations": False,
     "show_signature": False,
-    "reference_url": {},
     "thumbnail_size": (480, 336),
     "capture_repr": ("_repr_html_", "__repr__"),
     "ignore_repr_types": r"matplotlib\.|list|tuple|NoneType",
-    "image_scrapers": ("matplotlib",),
     "reset_modules": ("matplotlib",),
     "write_computation_times": False,
 }
@@ -109,17 +100,15 @@ html_show_sourcelink = False
 html_theme_options = {
     "navbar_align": "left",
     "header_links_before_dropdown": 6,
-    "show_prev_next": True,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
     "footer_end": ["theme-version"],
     "show_toc_level": 2,
-    "navigation_with_keys": False,
     "logo": {"text": "kcam"},
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
 html_sidebars = {"index": []}
-html_context = {"default_mode": "auto"}
+html_context = {"default_mode": "auto"}  # else the theme logs an error
 
 docstrings.write_reference(DOCS / "reference" / "api")

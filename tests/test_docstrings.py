@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import doctest
 import importlib
 import inspect
@@ -10,7 +9,6 @@ import math
 import random
 import sys
 import warnings
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +20,9 @@ from kcam import Camera, Plan, Scene, data, isp, optics, plots, sensor, spectral
 from kcam import augmentation as KC
 from kcam.units import mm, nm, um
 
-PACKAGE = Path(kcam.__file__).parent
-LISTED = ("", ".optics", ".sensor", ".isp", ".augmentation", ".data", ".style", ".planner", ".tradeoff", ".plots")
-"""Modules whose `__all__` says what is public."""
-PLAIN = (".spectral", ".files", ".units", ".effects", ".measure")
-"""Modules in which all that is defined without an underscore is."""
+sys.path.insert(0, str(Path(__file__).parents[1] / "docs" / "_ext"))
+import docstrings
+
 METHODS = (Camera, Scene, Plan, optics.Lens, optics.CompoundLens, optics.Imaging, optics.MeasuredPSF)
 NAMESPACE = {
     "Camera": Camera, "KC": KC, "Plan": Plan, "Scene": Scene, "data": data, "isp": isp, "kcam": kcam, "math": math,
@@ -38,25 +34,12 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 QUICK, MOST_LINES = 30, 5
 
 
-def public() -> dict[str, Any]:
-    """Full name -> value of all that is public, each once, but for modules."""
-    found: dict[str, Any] = {}
-    for suffix in LISTED:
-        module = importlib.import_module(f"kcam{suffix}")
-        named = {name: getattr(module, name) for name in module.__all__ if name != "__version__"}
-        found |= {f"{module.__name__}.{name}": value for name, value in named.items() if not inspect.ismodule(value)}
-    for suffix in PLAIN:
-        module = importlib.import_module(f"kcam{suffix}")
-        for name, value in vars(module).items():
-            own = getattr(value, "__module__", None) == module.__name__ and (name[0] != "_" and value.__doc__)
-            if own and (inspect.isfunction(value) or inspect.isclass(value)):
-                found[f"{module.__name__}.{name}"] = value
-    seen: set[int] = set()
-    return {name: value for name, value in found.items() if id(value) not in seen and not seen.add(id(value))}
-
-
-NAMES = public()
-CODE = {name: value for name, value in NAMES.items() if inspect.isclass(value) or inspect.isfunction(value)}
+NAMES = {
+    f"{module}.{name}": getattr(importlib.import_module(module), name)
+    for module in docstrings.MODULES
+    for name in docstrings.members(module)
+}
+CODE = {name: value for name, value in NAMES.items() if callable(value)}
 IN_THE_QUICK_TESTS = set(random.Random(0).sample(sorted(CODE), QUICK))
 
 
@@ -84,14 +67,7 @@ def test_every_class_and_function_has_an_example() -> None:
 
 
 def test_every_constant_says_what_it_holds() -> None:
-    told = set()
-    for path in PACKAGE.rglob("*.py"):
-        package = ".".join(("kcam", *path.relative_to(PACKAGE).parts[:-1][:1]))
-        for node, after in pairwise(ast.parse(path.read_text()).body):
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                told |= {f"{package}.{target.id}" for target in targets if isinstance(target, ast.Name)}
-    assert sorted(NAMES.keys() - CODE.keys() - told) == []
+    assert [name for name in NAMES.keys() - CODE.keys() if not docstrings.told(*name.rsplit(".", 1))] == []
 
 
 @pytest.mark.parametrize("cls", METHODS, ids=lambda cls: cls.__name__)
