@@ -74,6 +74,8 @@ GALLERIES = {"lessons": "learn", "recipes": "do/recipes", "pictures": "gallery"}
 sphinx_gallery_conf = {
     "examples_dirs": [*GALLERIES],
     "gallery_dirs": [*GALLERIES.values()],
+    "doc_module": ("kcam",),
+    "backreferences_dir": "reference/backreferences",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
     "remove_config_comments": True,

@@ -209,4 +209,6 @@ for lamp, name in lamps.items():
 # Am. J. Psychol. 95, 537 (1982): metameric blacks. Mallett and Yuksel, *Spectral Primary Decomposition for Rendering
 # with sRGB Reflectance*, EGSR 2019. CIE 15, *Colorimetry*: the observer and the lamps.
 #
+# In the gallery: :doc:`/gallery/plot_colour_chart_spectra`, :doc:`/gallery/plot_colour_illuminants`.
+#
 # Next: :doc:`plot_2_one_lens`, in which this light is focused, and colours part.

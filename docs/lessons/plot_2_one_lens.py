@@ -257,4 +257,7 @@ for radius in (25, 55):
 # Wolf, *Principles of Optics*, 7th ed., 8.5.2: Airy's pattern. Lens: ``kcam/optics/lens.py``; the propagators that
 # compute PSFs, and how accurate each is, are printed by ``lens.explain``.
 #
+# In the gallery: :doc:`/gallery/plot_psf_airy`, :doc:`/gallery/plot_psf_through_focus`,
+# :doc:`/gallery/plot_psf_singlet_colours`.
+#
 # Next: :doc:`plot_3_aberrations_and_real_lenses`, or why a perfect lens cannot be bought.

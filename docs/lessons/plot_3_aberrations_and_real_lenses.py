@@ -285,4 +285,7 @@ assert math.isclose(light, math.cos(math.atan(0.36)) ** 4, rel_tol=0.01)
 # :math:`q` is in Jenkins and White, *Fundamentals of Optics*, 4th ed., 9.5, for the longitudinal aberration
 # :math:`4 W_{040} f^2 / a^2`.
 #
+# In the gallery: :doc:`/gallery/plot_psf_zernike`, :doc:`/gallery/plot_psf_astigmatism`,
+# :doc:`/gallery/plot_psf_over_the_field`.
+#
 # Next: :doc:`plot_4_depth_and_occlusion`.

@@ -261,4 +261,7 @@ for start, expected in ((1.85, 1.7), (2.3, twin)):
 # 2014: the depth map of the motorcycle. Potmesil and Chakravarty, SIGGRAPH 1981: the first pictures with a lens, and
 # the light that leaks past edges.
 #
+# In the gallery: :doc:`/gallery/plot_aperture_depth_of_field`, :doc:`/gallery/plot_aperture_bokeh`,
+# :doc:`/gallery/plot_depth_fence`.
+#
 # Next: :doc:`plot_5_mosaic_and_demosaic`.

@@ -258,4 +258,7 @@ for ax, stop, picture in zip(axes, stops, seen, strict=True):
 # Processing 16, 132 (2007). Lu and Tan, IEEE Trans. Image Processing 12, 1194 (2003): the zipper. All methods with
 # their PSNR and cost: ``isp.DEMOSAICS``.
 #
-# Next: lesson 6, photons, noise and the ADC: where the noise came from.
+# In the gallery: :doc:`/gallery/plot_sensor_mosaics`, :doc:`/gallery/plot_sensor_moire`,
+# :doc:`/gallery/plot_isp_demosaics`.
+#
+# Next: :doc:`plot_6_photons_noise_adc`, or where the noise came from.

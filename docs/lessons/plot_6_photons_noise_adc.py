@@ -249,4 +249,6 @@ assert torch.allclose(slope, torch.ones_like(slope))
 # Courville, arXiv 1308.3432: the straight-through estimator. Widrow and Kollar, *Quantization Noise* (Cambridge 2008):
 # when 1/12 is right.
 #
-# Next: lesson 7, colour, from these numbers to a picture that looks right.
+# In the gallery: :doc:`/gallery/plot_sensor_photons`, :doc:`/gallery/plot_sensor_bits`.
+#
+# Next: :doc:`plot_7_colour_to_srgb`, from these numbers to a picture that looks right.

@@ -267,4 +267,6 @@ for ax, (name, picture) in zip(axes, pictures.items(), strict=True):
 # (1993): a measure of it. Sharma, Wu and Dalal, Color Res. Appl. 30, 21 (2005): CIEDE2000. IEC 61966-2-1: sRGB. Darrodi
 # et al., J. Opt. Soc. Am. A 32, 381 (2015): measured filter curves.
 #
-# Next: lesson 8, training through all of it.
+# In the gallery: :doc:`/gallery/plot_colour_filters`, :doc:`/gallery/plot_colour_illuminants`.
+#
+# Next: :doc:`plot_8_training`.

@@ -288,5 +288,8 @@ assert rest < 1 / 14
 # Leonard and Courville, arXiv 1308.3432 (2013): straight-through gradients. Noll, J. Opt. Soc. Am. 66, 207 (1976):
 # Zernike polynomials. Mahajan, J. Opt. Soc. Am. 73, 860 (1983): Marechal's limit.
 #
+# In the gallery: :doc:`/gallery/plot_doe_letter`, :doc:`/gallery/plot_doe_cubic`,
+# :doc:`/gallery/plot_style_paintings`.
+#
 # This was the last lesson. ``examples/train_doe.py`` and ``examples/train_lens.py`` train a DOE for depth of field and
 # a triplet over its field; ``kcam train`` teaches a whole camera a style.
