@@ -28,10 +28,11 @@ from torch import Tensor, nn
 import kcam.augmentation as KC
 from benchmarks.common import Contestant, environment, race, write_json
 from kcam import Camera, Scene, isp, measure, optics, sensor, threads
-from kcam.augmentation.base import is_picture, to_light, wavelengths_of
+from kcam.augmentation.base import is_picture, wavelengths_of
 from kcam.augmentation.isp import planck_ratio
 from kcam.context import Context
 from kcam.isp import tone_curve
+from kcam.srgb import to_light
 from kcam.units import wavelength_grid
 
 RESULTS = Path(__file__).parent / "results" / "augmentation.json"

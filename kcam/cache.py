@@ -193,7 +193,7 @@ class ValueCache:
             key = (value_of(key, tensors), modes)
         except Unknown:
             return build()
-        if any(map(_recorded, tensors)):
+        if any(map(recorded, tensors)):
             return build()
         for kept in self._kept:
             if kept[0] == key and all(map(_same_bits, kept[1], tensors)):
@@ -219,9 +219,18 @@ def has_derivative(value: Any) -> bool:
     return any(map(differentiated, tensors))
 
 
-def _recorded(tensor: Tensor) -> bool:
+def recorded(tensor: Tensor) -> bool:
     """Whether what is computed from a tensor now carries a derivative; no_grad stops graphs, but not tangents."""
     return (tensor.requires_grad and torch.is_grad_enabled()) or _has_tangent(tensor)
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor is numbers and no more: no derivative is recorded, no transform of torch.func nor the compiler
+    looks on. What is made of it may be worked on in place.
+    """
+    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
+        return False
+    return not recorded(tensor)
 
 
 def _same_bits(a: Tensor, b: Tensor) -> bool:

@@ -16,11 +16,10 @@ from typing import TypeGuard
 
 import numpy as np
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 from torch.nn import functional as F
 
-from kcam import spectral
+from kcam import spectral, srgb
 from kcam.cache import differentiated
 from kcam.inputs import as_map, as_values, band_remedy, check_bands, check_picture, describe, remedy
 from kcam.precision import full_precision
@@ -131,7 +130,7 @@ class Scene:
         check_picture(image, name="image")
         image = image[None] if image.ndim == 3 else image
         channels = image.shape[1]
-        linear = rgb_to_linear_rgb(image.expand(-1, 3, -1, -1))[:, :channels]
+        linear = srgb.to_light(image)
         grid = wavelength_grid(wavelengths)
         error = spectral.rgb_error(grid) if channels == 3 else 0.0
         if error > ROUGH:
@@ -314,7 +313,7 @@ class Scene:
 
     def to_srgb(self) -> Tensor:
         """The picture that an ideal camera without lens would take, (B,3,H,W) sRGB clipped to [0,1], for looking at."""
-        return linear_rgb_to_rgb(spectral.xyz_to_linear_srgb(self.xyz()).clamp(0, 1))
+        return srgb.to_code(spectral.xyz_to_linear_srgb(self.xyz()))
 
     def to(self, device: torch.device | str | torch.dtype | None = None, dtype: torch.dtype | None = None) -> Scene:
         """The scene on another device or in another floating-point type. What is kept as float64 stays so."""

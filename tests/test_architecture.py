@@ -20,7 +20,7 @@ LAYERS = [
     {"kcam.threads", "kcam.memory"},
     {"kcam.units", "kcam.ste", "kcam.cache", "kcam.precision", "kcam.measure"}
     | {"kcam.plain", "kcam.layers", "kcam.compiled"},
-    {"kcam.context", "kcam.inputs"},
+    {"kcam.context", "kcam.inputs", "kcam.srgb"},
     {"kcam.spectral", "kcam.files", "kcam.effects"},
     {"kcam.scene"},
     {"kcam.optics"},

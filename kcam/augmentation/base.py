@@ -15,13 +15,12 @@ from typing import Any
 
 import kornia.augmentation as K
 import torch
-from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
 
 from kcam.augmentation.distributions import Draw, Draws
 from kcam.inputs import ALPHA, as_map, as_values, channels_last, check_floats, remedy, scale_remedy
-from kcam.isp import tone_curve
 from kcam.precision import full_precision
+from kcam.srgb import to_code, to_light
 from kcam.units import nm, wavelength_grid
 
 RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
@@ -36,13 +35,6 @@ _LEAST, _LARGEST = -0.5, 2.5
 def is_picture(signal: Tensor) -> bool:
     """Whether a tensor (..., C, H, W) is a coded picture rather than a cube of linear light."""
     return signal.shape[-3] in (1, 3)
-
-
-def to_light(picture: Tensor) -> Tensor:
-    """Coded sRGB (..., 1 or 3, H, W) to linear light; the slope is finite everywhere."""
-    channels = picture.shape[-3]
-    linear = rgb_to_linear_rgb(picture.expand(*picture.shape[:-3], 3, -1, -1))
-    return linear[..., :channels, :, :]
 
 
 def wavelengths_of(signal: Tensor, given: Tensor | None) -> Tensor:
@@ -146,13 +138,61 @@ class Checked:
             check_layout(input, wavelengths=self.wavelengths, alpha=self.takes_alpha)
         return super().forward(input, params, **kwargs)  # type: ignore[misc]
 
+    def transform_inputs(
+        self,
+        input: Tensor,
+        params: dict[str, Any],
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Kornia's, without its choice between two whole batches: `on_drawn_rows` leaves the other rows as they are.
 
-def drawn_rows(params: dict[str, Any], *, p: float) -> Tensor | None:
-    """Which rows of a batch were drawn, (R,); None for all, also where torch.compile must not ask."""
+        torch.compile must not ask which rows were drawn: there all are transformed, and Kornia chooses.
+        """
+        if torch.compiler.is_compiling():
+            return super().transform_inputs(input, params, flags, transform, **kwargs)  # type: ignore[misc]
+        own: Any = self
+        params, flags = own._process_kwargs_to_params_and_flags(params, flags, **kwargs)
+        batch = own.transform_tensor(input)
+        own.validate_tensor(batch)
+        output = own.apply_transform(batch, params, flags, transform=transform)
+        return own.transform_output_tensor(output, input.shape)
+
+
+def on_drawn_rows(
+    input: Tensor,
+    params: dict[str, Any],
+    drawn: dict[str, Tensor],
+    effect: Callable[[Tensor, dict[str, Tensor]], Tensor],
+    *,
+    p: float,
+) -> Tensor:
+    """effect(rows, their numbers) of the rows of a batch that were drawn; the others as they are, and at no cost.
+
+    drawn: the numbers of all rows, (B, ...) each.
+    """
     if torch.compiler.is_compiling() or p == 1 or "batch_prob" not in params:
-        return None
+        return effect(input, drawn)
     gate = torch.atleast_1d(params["batch_prob"] > 0.5)
-    return None if bool(gate.all()) else gate.nonzero().flatten()
+    if bool(gate.all()):
+        return effect(input, drawn)
+    rows = gate.nonzero().flatten()
+    if rows.numel() == 0:
+        return input
+    here = rows.to(input.device)
+    result = effect(input.index_select(0, here), {name: value[rows] for name, value in drawn.items()})
+    if result.shape[1:] != input.shape[1:]:
+        raise mixed(input.shape[1], result.shape[1], p=p)
+    return input.index_copy(0, here, result)
+
+
+def mixed(channels: int, after: int, *, p: float) -> ValueError:
+    """What is wrong where some rows of a batch would get other channels."""
+    return ValueError(
+        f"this augmentation turns {channels} channels into {after}, which only some rows of a batch cannot have. "
+        f"Use p=1.0, not p={p:g}."
+    )
 
 
 class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
@@ -205,40 +245,19 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
         if after == channels:
             return drawn
         if self.p < 1:
-            raise self._mixed(channels, after)
+            raise mixed(channels, after, p=self.p)
         return drawn | {"output_size": torch.tensor([[after, *batch_shape[-2:]]]).expand(batch, 3)}
-
-    def _mixed(self, channels: int, after: int) -> ValueError:
-        return ValueError(
-            f"{type(self).__name__} turns {channels} channels into {after}, which only some rows of a batch cannot "
-            f"have. Use p=1.0, not p={self.p:g}."
-        )
 
     def apply_transform(
         self, input: Tensor, params: dict[str, Any], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Kornia's hook: the rows that were drawn through `simulate`."""
         linear = "linear" in params  # from `CameraSequential`, between a colour filter and a tone curve
-        return self.on_drawn_rows(input, params, functools.partial(self._simulated, linear=linear))
-
-    def on_drawn_rows(
-        self, input: Tensor, params: dict[str, Any], function: Callable[[Tensor, dict[str, Tensor]], Tensor]
-    ) -> Tensor:
-        """`function` of the rows that were drawn; the others as they are."""
         drawn = self._drawn(params, input)
-        if input.shape[0] == 0 or input.numel() == 0:
+        if input.numel() == 0:
             shape = (input.shape[0], self.output_channels(input.shape[1]), *input.shape[2:])
             return input.new_zeros(shape) + input.sum()
-        rows = drawn_rows(params, p=self.p)
-        if rows is None:
-            return function(input, drawn)
-        if rows.numel() == 0:
-            return input
-        here = rows.to(input.device)
-        result = function(input.index_select(0, here), {name: value[rows] for name, value in drawn.items()})
-        if result.shape[1:] != input.shape[1:]:
-            raise self._mixed(input.shape[1], result.shape[1])
-        return input.index_copy(0, here, result)
+        return on_drawn_rows(input, params, drawn, functools.partial(self._simulated, linear=linear), p=self.p)
 
     def _drawn(self, params: dict[str, Any], input: Tensor) -> dict[str, Tensor]:
         """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""
@@ -269,4 +288,4 @@ def simulated(input: Tensor, effect: Callable[[Tensor], Tensor], *, linear: bool
     with full_precision(input.device):
         coded = in_light and is_picture(working) and not linear
         result = effect(to_light(working) if coded else working)
-        return (tone_curve(result) if coded else result).to(input.dtype)
+        return (to_code(result) if coded else result).to(input.dtype)

@@ -14,7 +14,7 @@ from kornia.geometry.keypoints import Keypoints
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from kcam.augmentation.base import Checked, check_probability, drawn_rows
+from kcam.augmentation.base import Checked, check_probability, on_drawn_rows
 from kcam.augmentation.distributions import Bounds, Draws, Uniform
 from kcam.precision import full_precision
 
@@ -181,12 +181,10 @@ class RandomLensDistortion(MovedPixels):
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
-        rows = drawn_rows(params, p=self.p)
-        if rows is None:
-            return self._remapped(input, params, flags, inverse=False)
-        drawn = {name: value[rows] if name in self._param_generator.draws else value for name, value in params.items()}
-        here = rows.to(input.device)
-        return input.index_copy(0, here, self._remapped(input[here], drawn, flags, inverse=False))
+        drawn = {name: params[name] for name in self._param_generator.draws}
+        return on_drawn_rows(
+            input, params, drawn, lambda rows, own: self._remapped(rows, own, flags, inverse=False), p=self.p
+        )
 
     def _lens(self, params: dict[str, Tensor], shape: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
         """Camera matrices (B,3,3) and coefficients (B,4), float64."""

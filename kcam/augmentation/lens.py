@@ -14,7 +14,7 @@ from kornia.constants import Resample
 from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
-from kcam.augmentation.base import check_probability, drawn_rows, simulated, wavelengths_of
+from kcam.augmentation.base import check_probability, on_drawn_rows, simulated, wavelengths_of
 from kcam.augmentation.distributions import Bounds, Choice, Draw, Draws, Uniform
 from kcam.augmentation.geometry import MovedPixels
 from kcam.cache import Settings, ValueCache
@@ -212,15 +212,13 @@ class RandomLens(MovedPixels):
         """The rows that were drawn through `simulate`."""
         if input.numel() == 0:
             return input.new_zeros(input.shape) + input.sum()
-        rows = drawn_rows(params, p=self.p)
         linear = "linear" in params  # from `CameraSequential`, between a colour filter and a tone curve
         drawn = {name: params[name] for name in self._param_generator.draws}
-        if rows is None:
-            return simulated(input, lambda light: self.simulate(light, drawn), linear=linear)
-        if rows.numel() == 0:
-            return input
-        own, here = {name: value[rows] for name, value in drawn.items()}, rows.to(input.device)
-        return input.index_copy(0, here, simulated(input[here], lambda light: self.simulate(light, own), linear=linear))
+
+        def effect(rows: Tensor, own: dict[str, Tensor]) -> Tensor:
+            return simulated(rows, lambda light: self.simulate(light, own), linear=linear)
+
+        return on_drawn_rows(input, params, drawn, effect, p=self.p)
 
     # ---- what goes with it -----------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, per_sample
 from kcam.augmentation.distributions import Bounds, Choice, Draw, Seed, Uniform
+from kcam.cache import is_plain
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.isp import ColourMatrix, Demosaic, ToneCurve, WhiteBalance, demosaic
@@ -202,7 +203,8 @@ class RandomExposure(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """The gradient beyond the well is that of `clip_ste`."""
-        return clip_ste(signal * per_sample(2 ** drawn["stops"], signal), 0.0, 1.0)
+        exposed = signal * per_sample(2 ** drawn["stops"], signal)
+        return exposed.clamp_(0, 1) if is_plain(exposed) else clip_ste(exposed, 0.0, 1.0)
 
 
 class RandomQuantisation(CameraAugmentation):
@@ -235,5 +237,4 @@ class RandomQuantisation(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Each row with its own steps."""
-        bits = (self.fewest + drawn["bits"]).tolist()
-        return torch.cat([quantise(signal[i : i + 1], bits=count) for i, count in enumerate(bits)])
+        return quantise(signal, bits=(self.fewest + drawn["bits"])[:, None, None, None])

@@ -14,13 +14,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import tifffile
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
+from kcam import srgb
 from kcam.data.cube import words_of
 from kcam.scene import Scene, fitted, read_picture, target_shape
 from kcam.units import as_numbers, check_distances
@@ -154,7 +154,7 @@ class PhotoDataset(Dataset[Photo]):
             depth, mask = planes[:1], planes[1:] > 0
         if self.size is not None:
             shape = target_shape(self.size, shape)
-            image = linear_rgb_to_rgb(fitted(rgb_to_linear_rgb(image)[None], shape)[0]).clamp(0, 1)
+            image = srgb.to_code(fitted(srgb.to_light(image)[None], shape)[0])
             planes = fitted(torch.cat([depth, mask.float()])[None], shape, pick=True)[0]
             depth, mask = planes[:1], planes[1:] > 0
         window: tuple[slice, ...] = (slice(None),)

@@ -6,10 +6,10 @@ import functools
 from collections.abc import Sequence
 
 import torch
-from kornia.color import linear_rgb_to_rgb
 from torch import Tensor, nn
 
-from kcam import spectral
+from kcam import spectral, srgb
+from kcam.cache import is_plain
 from kcam.context import Context, Curves, Stage
 from kcam.inputs import ALPHA, channels_last, check_signal, remedy
 from kcam.sensor.colour_filter import ColourFilter
@@ -277,11 +277,7 @@ def tone_curve(signal: Tensor, *, gamma: Tensor | None = None, contrast: Tensor 
             f"the sRGB curve takes 3 channels, or 1 of gray, got {channels}. Put a ColourMatrix before it."
             f"{remedy(signal, name='signal', scaled=False)}"
         )
-    clipped = clip_ste(signal, 0.0, 1.0)
-    if channels == 3:
-        coded = linear_rgb_to_rgb(clipped)
-    else:
-        coded = linear_rgb_to_rgb(clipped.expand(*signal.shape[:-3], 3, -1, -1))[..., :1, :, :]
+    coded = srgb.to_code(signal)
     if gamma is None and contrast is None:
         return coded
     held = [coded.new_tensor(1.0) if gamma is None else gamma, coded.new_tensor(0.0) if contrast is None else contrast]
@@ -309,7 +305,12 @@ def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
     """
     offset = 0.01
     low = offset**gamma
-    tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / ((1 + offset) ** gamma - low)
+    high = (1 + offset) ** gamma
+    if signal.dtype == torch.float32 and all(map(is_plain, (signal, gamma, contrast))):  # the same, in place
+        tone = signal.clamp(0, 1).add_(offset).log2_().mul_(gamma).exp2_().sub_(low).div_(high - low)
+        bend = tone.mul(-2).add_(3).mul_(tone).sub_(1).mul_(2 * contrast).add_(1)
+        return tone.mul_(bend)
+    tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / (high - low)
     return tone + 2 * contrast * tone * (1 - tone) * (2 * tone - 1)
 
 

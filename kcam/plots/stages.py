@@ -13,12 +13,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
-from kornia.color import linear_rgb_to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from kcam import isp, optics, sensor, spectral
+from kcam import isp, optics, sensor, spectral, srgb
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context
 from kcam.inputs import describe
@@ -242,7 +241,7 @@ def looked(
         top = _top(bright.amax(0))
         planes = (bright / top).clamp(0, 1)
         shown += (f"{dark} \u00d7 {1 / top:.3g}, sRGB gamma",)
-        planes = planes if tile is not None else linear_rgb_to_rgb(planes.expand(3, -1, -1))
+        planes = planes if tile is not None else srgb.to_code(planes).expand(3, -1, -1)
     if tile is None:
         image = as_image(planes)
         return cut(image, image, zoom=zoom, across=across, shown=shown)

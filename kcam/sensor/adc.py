@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcam.cache import is_plain
 from kcam.context import Context, Stage
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
 from kcam.ste import clip_ste, round_ste
@@ -17,7 +18,7 @@ from kcam.units import check_positive
 def quantise(
     signal: Tensor,
     *,
-    bits: int,
+    bits: int | Tensor,
     black_level: Tensor | float = 0.0,
     gain: Tensor | float = 1.0,
     rounding: bool = True,
@@ -29,7 +30,8 @@ def quantise(
     in this order: amplify, add the black level, clip, round. The gradient is `gain` inside the range, whatever the
     rounding, and that of `clip_ste` outside.
 
-    Args:      signal: any shape, 1.0 = full well.  bits: 1..24, the steps that float32 can hold.
+    Args:      signal: any shape, 1.0 = full well.  bits: 1..24, the steps that float32 can hold; a tensor
+               of whole numbers is broadcast against the signal.
                black_level: the number that no light gives [DN].  gain: analogue gain, 1 at base ISO.
                rounding: False leaves the steps out.
     Returns:   same shape, 1.0 = full scale (2^bits - 1 DN).
@@ -39,9 +41,16 @@ def quantise(
     >>> [round(float(15 * sensor.quantise(torch.tensor(share), bits=4)), 3) for share in (0.0, 0.31, 1.7)]  # DN of 15
     [0.0, 5.0, 15.0]
     """
-    top = 2**bits - 1
-    level = clip_ste(signal * like(gain, signal) + like(black_level, signal) / top, 0.0, 1.0)
-    return round_ste(level * top) / top if rounding else level
+    top = 2**bits - 1 if isinstance(bits, int) else like(2**bits - 1, signal)
+    amplified = signal if _is(gain, 1.0) else signal * like(gain, signal)
+    level = clip_ste(amplified if _is(black_level, 0.0) else amplified + like(black_level, signal) / top, 0.0, 1.0)
+    if not rounding:
+        return level
+    return level.mul_(top).round_().div_(top) if is_plain(level) else round_ste(level * top) / top
+
+
+def _is(value: Tensor | float, neutral: float) -> bool:
+    return not isinstance(value, Tensor) and value == neutral
 
 
 class ADC(Stage):

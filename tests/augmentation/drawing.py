@@ -11,8 +11,9 @@ from torch import Tensor
 
 import kcam.augmentation as KC
 from kcam import Scene, optics
-from kcam.augmentation.base import is_picture, to_light
+from kcam.augmentation.base import is_picture
 from kcam.isp import tone_curve
+from kcam.srgb import to_light
 from kcam.units import wavelength_grid
 
 PRIMARIES = wavelength_grid(list(KC.RGB_WAVELENGTHS))

@@ -26,7 +26,8 @@ from torch.nn import functional as F
 
 import kcam.augmentation as KC
 from kcam import Scene, optics
-from kcam.augmentation.base import to_light, wavelengths_of
+from kcam.augmentation.base import wavelengths_of
+from kcam.srgb import to_light
 from kcam.units import mm, nm, um, wavelength_grid
 
 CHANNELS = pytest.mark.parametrize("channels", [1, 3, 28])
