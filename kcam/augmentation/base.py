@@ -8,7 +8,6 @@ Y = 1, as in `Scene.from_bands`: about 1 in each band, not 1.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -18,9 +17,11 @@ import torch
 from torch import Tensor
 
 from kcam.augmentation.distributions import Draw, Draws
+from kcam.cache import is_plain
 from kcam.inputs import ALPHA, as_map, as_values, channels_last, check_floats, remedy, scale_remedy
 from kcam.precision import full_precision
 from kcam.srgb import to_code, to_light
+from kcam.ste import clip_ste
 from kcam.units import nm, wavelength_grid
 
 RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
@@ -252,12 +253,16 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
         self, input: Tensor, params: dict[str, Any], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Kornia's hook: the rows that were drawn through `simulate`."""
-        linear = "linear" in params  # from `CameraSequential`, between a colour filter and a tone curve
         drawn = self._drawn(params, input)
         if input.numel() == 0:
             shape = (input.shape[0], self.output_channels(input.shape[1]), *input.shape[2:])
             return input.new_zeros(shape) + input.sum()
-        return on_drawn_rows(input, params, drawn, functools.partial(self._simulated, linear=linear), p=self.p)
+
+
+        def effect(rows: Tensor, own: dict[str, Tensor]) -> Tensor:
+            return simulated(rows, lambda light: self.simulate(light, own), told=params, in_light=self.in_light)
+
+        return on_drawn_rows(input, params, drawn, effect, p=self.p)
 
     def _drawn(self, params: dict[str, Any], input: Tensor) -> dict[str, Tensor]:
         """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""
@@ -274,18 +279,22 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
             drawn["inverse_depth"] = check_inverse_depth(params["inverse_depth"], input)
         return drawn
 
-    def _simulated(self, input: Tensor, drawn: dict[str, Tensor], *, linear: bool) -> Tensor:
-        return simulated(input, lambda light: self.simulate(light, drawn), linear=linear, in_light=self.in_light)
 
-
-def simulated(input: Tensor, effect: Callable[[Tensor], Tensor], *, linear: bool, in_light: bool = True) -> Tensor:
+def simulated(
+    input: Tensor, effect: Callable[[Tensor], Tensor], *, told: Mapping[str, Any], in_light: bool = True
+) -> Tensor:
     """An effect on (B,C,H,W), checked, in float32 at least and outside of autocast; of the type of the input.
 
-    linear: whether a picture is linear light already. in_light: whether the effect wants that.
+    told: by a `CameraSequential`: "linear", that a picture is linear light already, between a colour filter and a tone
+    curve; and "run", between neighbours that take light too, so that it is still to be clipped as a picture is.
+    in_light: whether the effect wants light.
     """
     working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-    check_values(working, picture=is_picture(working) and not linear)
+    picture = is_picture(working) and "linear" not in told
+    check_values(working, picture=picture)
     with full_precision(input.device):
-        coded = in_light and is_picture(working) and not linear
+        coded = in_light and picture
         result = effect(to_light(working) if coded else working)
+        if "run" in told:
+            result = result.clamp_(0, 1) if result is not working and is_plain(result) else clip_ste(result, 0.0, 1.0)
         return (to_code(result) if coded else result).to(input.dtype)

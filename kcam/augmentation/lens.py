@@ -212,11 +212,10 @@ class RandomLens(MovedPixels):
         """The rows that were drawn through `simulate`."""
         if input.numel() == 0:
             return input.new_zeros(input.shape) + input.sum()
-        linear = "linear" in params  # from `CameraSequential`, between a colour filter and a tone curve
         drawn = {name: params[name] for name in self._param_generator.draws}
 
         def effect(rows: Tensor, own: dict[str, Tensor]) -> Tensor:
-            return simulated(rows, lambda light: self.simulate(light, own), linear=linear)
+            return simulated(rows, lambda light: self.simulate(light, own), told=params)
 
         return on_drawn_rows(input, params, drawn, effect, p=self.p)
 

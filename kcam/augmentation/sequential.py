@@ -17,7 +17,7 @@ from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from torch import Tensor, nn
 
-from kcam.augmentation.base import TAKES, CameraAugmentation, check_layout, wavelengths_of
+from kcam.augmentation.base import TAKES, CameraAugmentation, check_layout, check_values, is_picture, wavelengths_of
 from kcam.augmentation.lens import RandomLens
 from kcam.augmentation.optics import finite_vergence
 from kcam.camera import DEMOSAICING, Camera
@@ -27,6 +27,7 @@ from kcam.isp import ToneCurve
 from kcam.optics import Imaging
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, Mosaic
+from kcam.srgb import to_code, to_light
 from kcam.units import wavelength_grid
 
 _NEAR = 100.0  # 1/m, a centimetre: nearer than pictures are taken from
@@ -40,6 +41,7 @@ class CameraSequential(K.AugmentationSequential):
       augmentations between a ColourFilter and a ToneCurve work on the linear light that is there.
     - Every augmentation draws for the channels that really reach it (Kornia's containers draw for those of the input).
       A module of one's own says what it gives by a method ``output_channels(channels)``.
+    - A picture stays in linear light between neighbours that all work there, and is coded once behind them.
     - The first mask is a map of inverse depth [1/m], 0 at infinity, which `RandomDefocus`, `RandomCamera` and `Imaging`
       see as it is when they are reached: flipped and cropped with the picture. Inside another container there are no
       masks to see, so a nested one takes its own distances.
@@ -126,6 +128,7 @@ class CameraSequential(K.AugmentationSequential):
             after[-3] = self._after(module, batch_shape[-3], context)
             batch_shape = torch.Size(after)
             params.append(param)
+        self.transform_op.begin(params)
         return params
 
     def transform_inputs(
@@ -134,13 +137,16 @@ class CameraSequential(K.AugmentationSequential):
         """What another container calls: pictures alone."""
         self.clear_state()
         self._enters(input)
+        light = _Light(self.takes_light(params))
         for param in params:
             module = self.get_submodule(param.name)
             if self.runs(module):
                 input = self.run(module, input, depth=None)
             else:
-                told = {**(extra_args or {}), **self.told(param.name)}
+                input, told = light.enter(module, param, input)
+                told = {**(extra_args or {}), **self.told(param.name), **told}
                 input = InputSequentialOps.transform(input, module=module, param=param, extra_args=told)
+                input = light.leave(input)
             self._update_transform_matrix_by_module(module)
         self._params = params
         return input
@@ -155,6 +161,16 @@ class CameraSequential(K.AugmentationSequential):
         module = self.get_submodule(name)
         ours = self.wavelengths is not None and isinstance(module, (CameraAugmentation, RandomLens))
         return {"cube": torch.ones(())} if ours else {}
+
+    def takes_light(self, params: list[ParamItem]) -> list[bool]:
+        """Which of the modules that a call runs takes a picture as linear light, and gives a picture."""
+        return [
+            isinstance(module, (CameraAugmentation, RandomLens))
+            and module.in_light
+            and name not in self._linear
+            and self._after(module, 3) == 3
+            for name, module in ((param.name, self.get_submodule(param.name)) for param in params)
+        ]
 
     @staticmethod
     def runs(module: nn.Module) -> bool:
@@ -194,6 +210,7 @@ class CameraSequential(K.AugmentationSequential):
     def forward(self, *args: Any, params: list[ParamItem] | None = None, data_keys: Any = None) -> Any:
         """As `K.AugmentationSequential`."""
         self.transform_op.names = []
+        self.transform_op.begin(params)
         return super().forward(*args, params=params, data_keys=data_keys)
 
     def _arguments_preproc(self, *args: Any, data_keys: Any, params: Any = None) -> Any:
@@ -233,6 +250,11 @@ class _Ops(AugmentationSequentialOps):
         super().__init__(data_keys)
         self.owner = [owner]  # in a list: a module in an attribute would be its child
         self.names: list[str] = []
+        self.light = _Light([])
+
+    def begin(self, params: list[ParamItem] | None) -> None:
+        """Look ahead at what is to be run, which is drawn in `forward_parameters` or given again."""
+        self.light = _Light(self.owner[0].takes_light(params or []))
 
     def transform(self, *arg: Any, module: nn.Module, param: ParamItem, extra_args: Any, data_keys: Any = None) -> Any:
         owner = self.owner[0]
@@ -248,9 +270,18 @@ class _Ops(AugmentationSequentialOps):
         if getattr(module, "takes_depth", False):
             depth = self._depth(arg, keys)
             own |= {} if depth is None else {"inverse_depth": depth}
+        inputs: list[Any] = list(arg)
+        picture = keys.index(DataKey.INPUT) if keys.count(DataKey.INPUT) == 1 else None
+        if picture is not None:
+            inputs[picture], told = self.light.enter(module, param, inputs[picture])
+            own |= told
         if own:
             extra_args = {**extra_args, DataKey.INPUT: {**extra_args.get(DataKey.INPUT, {}), **own}}
-        return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
+        found: Any = super().transform(*inputs, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
+        results = [found] if len(arg) == 1 else list(found)
+        if picture is not None:
+            results[picture] = self.light.leave(results[picture])
+        return results[0] if len(arg) == 1 else results
 
     def _place(self, keys: Sequence[DataKey]) -> int | None:
         """Which argument is the depth; None where none is."""
@@ -284,6 +315,50 @@ class _Ops(AugmentationSequentialOps):
         if not isinstance(arg[index], Tensor):
             raise TypeError("the depth is a list of masks of different sizes; expected one tensor (B,1,H,W).")
         return arg[index]
+
+
+class _Light:
+    """The way of a picture through neighbours that all take linear light: taken there once, and coded once behind them.
+
+    Rows that none of them drew come out as they went in.
+
+    Args:      takes: whether each module of a call does.
+    """
+
+    def __init__(self, takes: Sequence[bool]) -> None:
+        self._takes = [not torch.compiler.is_compiling() and each for each in takes] + [False]
+        self._place = -1
+        self._coded: Tensor | None = None
+
+    def enter(self, module: Any, param: ParamItem, input: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """What the next module gets, and is told of it."""
+        self._place = min(self._place + 1, len(self._takes) - 1)
+        if not self._takes[self._place]:
+            return input, {}
+        if self._coded is None:
+            if not self._takes[self._place + 1] or input.ndim not in (3, 4) or not is_picture(input):
+                return input, {}
+            check_values(input, picture=True)
+            self._coded, self._keepdim = input, True
+            batch = input if input.ndim == 4 else input[None]
+            self._drawn = torch.zeros(len(batch), dtype=torch.bool)
+            input = to_light(batch if batch.dtype in (torch.float32, torch.float64) else batch.float())
+        drawn: Any = param.data
+        self._drawn |= True if module.p == 1 else torch.atleast_1d(drawn["batch_prob"] > 0.5).cpu()
+        self._keepdim &= bool(module.keepdim)
+        return input, {"linear": torch.ones(()), "run": torch.ones(())}
+
+    def leave(self, output: Tensor) -> Tensor:
+        """What comes out of it."""
+        coded = self._coded
+        if coded is None or self._takes[self._place + 1]:
+            return output
+        self._coded = None
+        picture = to_code(output).to(coded.dtype)
+        others = (~self._drawn).nonzero().flatten().to(coded.device)
+        if len(others):
+            picture = picture.index_copy(0, others, coded.view_as(picture)[others])
+        return picture[0] if coded.ndim == 3 and self._keepdim else picture
 
 
 def _check_is_depth(mask: Any) -> None:

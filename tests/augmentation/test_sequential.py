@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import random
 from typing import Any
 
 import kornia.augmentation as K
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 
 import kcam.augmentation as KC
 from kcam import Scene, isp, optics, sensor
+from kcam.srgb import to_code
 from kcam.units import mm, um
 
 SQUARE = (20, 28)  # even, so that a flip moves every pixel
@@ -389,3 +391,69 @@ class TestDepth:
     def test_one_odd_size(self) -> None:
         sequence = KC.CameraSequential(defocus(), data_keys=["input", "mask"])
         assert sequence(picture(), picture(2, 1, *SIZE))[0].shape == (2, 3, *SIZE)
+
+
+# ---- neighbours that take light ------------------------------------------------------------------------------------
+
+
+def neighbours(seed: int, *, p: float, keepdim: bool = False) -> list[nn.Module]:
+    """Two to five augmentations, some on coded pictures; without steps or photons, which would show a rounding."""
+    draw = random.Random(seed)
+    kinds = [KC.RandomExposure, KC.RandomWhiteBalance, KC.RandomVignetting, KC.RandomDefocus, KC.RandomToneCurve,
+             KC.RandomColourMatrix, KC.RandomLensDistortion]  # fmt: skip
+    return [kind(p=p, keepdim=keepdim) for kind in draw.choices(kinds, k=draw.randint(2, 5))]
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("p", [1.0, 0.5])
+def test_light_that_is_kept_gives_the_same_picture(seed: int, p: float) -> None:
+    """As Kornia's container, which codes the picture behind each; rows that nobody drew keep every bit."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = [(4, 3, 24, 40), (3, 24, 40), (2, 1, 24, 24), (1, 3, 33, 17)][seed % 4]
+    picture = torch.rand(shape, generator=generator, dtype=[torch.float32, torch.float64][seed % 2])
+    pipeline = neighbours(seed, p=p, keepdim=seed % 3 == 0)
+    torch.manual_seed(seed)
+    expected = K.AugmentationSequential(*pipeline)(picture)
+    torch.manual_seed(seed)
+    ours = KC.CameraSequential(*pipeline)
+    found = ours(picture)
+    assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+    idle = torch.stack([torch.atleast_1d(param.data["batch_prob"]) < 0.5 for param in ours._params]).all(0)
+    batch = picture if picture.ndim == 4 else picture[None]
+    assert torch.equal((found if found.ndim == 4 else found[None])[idle], batch[idle])
+    torch.testing.assert_close(ours(picture, params=ours._params), found, rtol=0, atol=0)  # a replay
+
+
+def test_light_is_kept_from_one_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coded once behind three neighbours, and on both sides of a flip."""
+    coded: list[Tensor] = []
+
+    def count(light: Tensor) -> Tensor:
+        coded.append(light)
+        return to_code(light)
+
+    for module in ("base", "sequential"):
+        monkeypatch.setattr(f"kcam.augmentation.{module}.to_code", count)
+    stages = KC.RandomExposure(p=1.0), KC.RandomWhiteBalance(p=1.0), KC.RandomVignetting(p=1.0)
+    KC.CameraSequential(*stages)(torch.rand(2, 3, 16, 16))
+    assert len(coded) == 1
+    KC.CameraSequential(stages[0], stages[1], K.RandomHorizontalFlip(), stages[2])(torch.rand(2, 3, 16, 16))
+    assert len(coded) == 3
+
+
+def test_gradients_through_light_that_is_kept() -> None:
+    picture = torch.rand(2, 3, 12, 12, dtype=torch.float64, requires_grad=True)
+    pipeline = KC.RandomExposure((-1.0, 0.0), p=1.0), KC.RandomVignetting(p=1.0), KC.RandomWhiteBalance(p=0.5)
+    found = []
+    for container in (KC.CameraSequential, K.AugmentationSequential):
+        torch.manual_seed(5)
+        found.append(torch.autograd.grad(container(*pipeline)(picture).square().sum(), picture)[0])
+    torch.testing.assert_close(*found)
+
+
+def test_pictures_out_of_range_are_refused_where_light_is_kept() -> None:
+    pipeline = KC.CameraSequential(KC.RandomExposure(p=1.0), KC.RandomVignetting(p=1.0))
+    with pytest.raises(ValueError, match="expected sRGB in"):
+        pipeline(255 * torch.rand(1, 3, 8, 8))
+    torch.testing.assert_close(pipeline(torch.zeros(1, 3, 8, 8)), torch.zeros(1, 3, 8, 8))  # and what follows is right
