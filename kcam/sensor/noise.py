@@ -27,9 +27,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kcam.cache import is_plain
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal
 from kcam.precision import full_precision
+from kcam.sensor import counting
 from kcam.ste import clip_ste
 from kcam.units import as_numbers, check_positive
 
@@ -94,6 +96,8 @@ def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 class _Poisson(torch.autograd.Function):
     @staticmethod
     def forward(rate: Tensor, generator: torch.Generator | None) -> Tensor:
+        if counting.can_count(rate):
+            return counting.counts(rate, generator)
         few = rate.device.type == "cpu" and not torch.compiler.is_compiling() and not (rate > COUNTED).any()
         counted = rate if few else rate.clamp(max=COUNTED)
         try:
@@ -174,8 +178,18 @@ def shot_noise(signal: Tensor, *, full_well: Tensor | float, generator: torch.Ge
     (100, 10)
     """
     capacity = like(full_well, signal)
+    if _in_place(signal, capacity):
+        electrons = poisson(signal.clamp(0, OVERFLOWING).mul_(capacity), generator=generator)
+        return electrons.div_(capacity).clamp_(max=1)
     rate = clip_ste(signal, 0.0, OVERFLOWING) * capacity
     return clip_ste(poisson(rate, generator=generator) / capacity, None, 1.0)
+
+
+def _in_place(signal: Tensor, value: Tensor | float) -> bool:
+    """Whether a new tensor of the signal's shape may be multiplied by a value where it lies."""
+    if not isinstance(value, Tensor):
+        return is_plain(signal)
+    return is_plain(signal) and is_plain(value) and torch.broadcast_shapes(value.shape, signal.shape) == signal.shape
 
 
 @in_float32
@@ -201,7 +215,10 @@ def read_noise(
     3.0
     """
     noise = torch.randn(signal.shape, generator=generator, dtype=signal.dtype, device=signal.device)
-    return signal + noise * (like(sigma_electrons, signal) / like(full_well, signal))
+    share = like(sigma_electrons, signal) / like(full_well, signal)
+    if _in_place(signal, share):
+        return noise.mul_(share).add_(signal)
+    return signal + noise * share
 
 
 def dark_electrons(
