@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import kornia.augmentation as K
@@ -16,10 +17,12 @@ from torch import Tensor
 
 from kcam.augmentation.base import Checked, check_probability, on_drawn_rows
 from kcam.augmentation.distributions import Bounds, Draws, Uniform
+from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.precision import full_precision
 
 _ITERATIONS = 40  # of the inverse, a fixed point, at most
 _TOLERANCE = 0.01  # of the inverse, at probes all over the picture [pixels]
+_NODES = 20  # on a side of the picture, through which a polynomial goes
 _EDGE_SAMPLES = 9  # of a box's edge: a straight edge becomes a curve
 
 
@@ -201,46 +204,53 @@ class RandomLensDistortion(MovedPixels):
         if points.numel() == 0:
             return points
         height, width = params["forward_input_shape"][-2:].tolist()
-        camera, coefficients = self._lens(params, (height, width), points.device)
         flat = points.double().flatten(1, -2)
+        return self._through(flat, params, (height, width), inverse=inverse).view(points.shape)
+
+    def _through(self, points: Tensor, params: dict[str, Tensor], shape: tuple[int, int], *, inverse: bool) -> Tensor:
+        """Points (B,N,2) float64 of a picture of that shape."""
+        camera, coefficients = self._lens(params, shape, points.device)
         if inverse:
-            return undistort_points(flat, camera, coefficients, num_iters=_ITERATIONS).view(points.shape)
-        return distort_points(flat, camera, coefficients).view(points.shape)
+            return undistort_points(points, camera, coefficients, num_iters=_ITERATIONS)
+        return distort_points(points, camera, coefficients)
 
     def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:
         if input.numel() == 0:
             return input
         working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-        batch, _, height, width = working.shape
-        camera, coefficients = self._lens(params, (height, width), working.device)
-        compiling = torch.compiler.is_compiling()
-        iterations = _ITERATIONS if compiling else _iterations((height, width), camera, coefficients)
-        camera, coefficients = camera.to(working), coefficients.to(working)
-        y, x = (torch.arange(n, dtype=working.dtype, device=working.device) for n in (height, width))
-        grid = torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1).reshape(1, -1, 2)
-        grid = grid.expand(batch, -1, -1)
+        shape = working.shape[-2], working.shape[-1]
+
+        def move(points: Tensor) -> Tensor:
+            return self._through(points.expand(len(working), -1, -1), params, shape, inverse=not inverse)
+
         with full_precision(working.device):
-            if inverse:
-                found = distort_points(grid, camera, coefficients)
-            else:
-                found = undistort_points(grid, camera, coefficients, num_iters=iterations)
-            source = found.view(batch, height, width, 2)
+            across, down = _moved_pixels(shape, move, working).unbind(1)
             mode = Resample.get(flags.get("resample", Resample.BILINEAR)).name.lower()
-            moved = remap(working, source[..., 0], source[..., 1], mode=mode, align_corners=True)
-        return moved.to(input.dtype)
+            return remap(working, across, down, mode=mode, align_corners=True).to(input.dtype)
 
 
-@torch.no_grad()
-def _iterations(shape: tuple[int, int], camera: Tensor, coefficients: Tensor) -> int:
-    """Of the inverse, until all probes are good to 1e-4 pixels."""
-    probes = _probes(shape).to(camera.device).expand(len(coefficients), -1, -1)
-    last = probes
-    for count in range(4, _ITERATIONS, 4):
-        here = undistort_points(probes, camera, coefficients, num_iters=count)
-        if float((here - last).abs().max()) < 1e-4:
-            return count
-        last = here
-    return _ITERATIONS
+def _moved_pixels(shape: tuple[int, int], move: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+    """Where all pixels of a picture move to, (B,2,H,W) as x, y, in the dtype of `like`.
+
+    move: float64 points (1,N,2) as x, y to (B,N,2), smoothly: it is asked for `_NODES`^2 points, and polynomials go
+    through these; for all pixels where that is off by 1e-4 pixels at probes, in small pictures and to torch.compile.
+    """
+    grid = [torch.arange(n, dtype=torch.float64, device=like.device) for n in (shape[1], shape[0])]
+    if shape[0] * shape[1] > 4 * _NODES**2 and not torch.compiler.is_compiling():
+        nodes = [chebyshev_between(pixels[0], pixels[-1], _NODES) for pixels in grid]
+        away = (move(torch.cartesian_prod(*nodes)[None]) - torch.cartesian_prod(*nodes)).unflatten(1, (_NODES, _NODES))
+        probes = [torch.linspace(0, n - 1, 9, dtype=torch.float64, device=like.device) for n in (shape[1], shape[0])]
+        between = [lagrange_weights(known, asked) for known, asked in zip(nodes, probes, strict=True)]
+        found = torch.einsum("px,bxyc,qy->bpqc", between[0], away, between[1]).flatten(1, 2)
+        missed = move(torch.cartesian_prod(*probes)[None]) - torch.cartesian_prod(*probes) - found
+        if float(missed.detach().abs().max()) < 1e-4:
+            across, down = (lagrange_weights(known, asked).to(like) for known, asked in zip(nodes, grid, strict=True))
+            moved = down @ away.permute(0, 3, 2, 1).to(like) @ across.mT
+            moved[:, 0] += grid[0].to(like)
+            moved[:, 1] += grid[1].to(like)[:, None]
+            return moved
+    every = torch.cartesian_prod(grid[1], grid[0]).flip(-1)
+    return move(every[None]).to(like).mT.unflatten(2, shape)
 
 
 def _probes(shape: tuple[int, int]) -> Tensor:

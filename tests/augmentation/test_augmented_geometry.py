@@ -11,6 +11,7 @@ from drawing import augmented, picture
 from torch import Tensor
 
 import kcam.augmentation as KC
+from kcam.augmentation.geometry import _moved_pixels
 
 SHAPES = pytest.mark.parametrize("shape", [(60, 80), (81, 55)])
 LENSES = {
@@ -198,3 +199,21 @@ def test_gradients_to_the_picture_and_to_the_coefficients() -> None:
     inputs = [image.requires_grad_(), *(params[name].double().clone().requires_grad_() for name in names)]
     # the inverse is a fixed point that stops at 1e-4 pixels: its slope is as good
     assert torch.autograd.gradcheck(distort, inputs, eps=1e-6, atol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_polynomial_between_nodes_is_where_pixels_go(seed: int) -> None:
+    """To 1e-3 pixels, by the inverse of each pixel, for random lenses and pictures; where it would not be, all are."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = tuple(torch.randint(50, 160, (2,), generator=generator).tolist())
+    k1, k2, p1, p2 = (2 * torch.rand(4, generator=generator) - 1).mul(torch.tensor([0.3, 0.1, 0.02, 0.02])).tolist()
+    augmentation = KC.RandomLensDistortion(k1=k1, k2=k2, p1=p1, p2=p2, p=1.0)
+    params = augmentation.forward_parameters(torch.Size((1, 3, *shape)))
+    for inverse in (False, True):
+        def move(points: Tensor, inverse: bool = inverse) -> Tensor:
+            return augmentation._through(points, params, shape, inverse=inverse)
+
+        found = _moved_pixels(shape, move, torch.zeros((), dtype=torch.float64))
+        y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in shape), indexing="ij")
+        exact = move(torch.stack([x, y], dim=-1).flatten(0, 1)[None]).mT.unflatten(2, shape)
+        torch.testing.assert_close(found, exact, rtol=0, atol=1e-3)
