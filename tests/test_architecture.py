@@ -188,6 +188,14 @@ def test_nothing_that_is_not_compiled_waits_for_the_compiler(code: str) -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_an_import_leaves_scipy_s_parts_for_later() -> None:
+    """They come as `scipy.part` when they are used: together they take half a second."""
+    late = ("scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.ndimage", "scipy.sparse", "scipy.special")
+    code = f"import sys, kcam; print([name for name in {late} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_typed_package_has_one_version() -> None:
     import kcam
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
+import scipy
 
 from kcam.data.cube import CubeError, Source
 from kcam.units import nm, wavelength_grid
@@ -150,9 +150,9 @@ def _interpolated(grid: np.ndarray, points: np.ndarray, method: str) -> np.ndarr
         return np.ones((len(points), 1))
     unit = np.eye(len(grid))
     if method == "cubic":
-        return CubicSpline(grid, unit)(inside)
+        return scipy.interpolate.CubicSpline(grid, unit)(inside)
     slopes = np.gradient(unit, grid, axis=0, edge_order=2 if len(grid) > 2 else 1)
-    return CubicHermiteSpline(grid, unit, slopes)(inside)
+    return scipy.interpolate.CubicHermiteSpline(grid, unit, slopes)(inside)
 
 
 def _averaged(grid: np.ndarray, target: np.ndarray, method: str) -> np.ndarray:

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import scipy
 import tifffile
 import torch
 from PIL import Image
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
@@ -285,7 +285,7 @@ def filled(depth: Tensor, *, name: str = "depth") -> Tensor:
         raise ValueError(f"{name} holds no distance: all its pixels are zero, NaN or infinite.")
     if known.all():
         return depth
-    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    rows, columns = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return depth[:, torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
 
 

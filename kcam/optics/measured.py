@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.interpolate import make_interp_spline
 from torch import Tensor, nn
 
 from kcam.inputs import as_values, describe
@@ -301,7 +301,7 @@ def _shares(own: int, wanted: int, ratio: float, active: float, even: bool = Fal
     """
     edges = np.arange(own + 1) - own // 2 - 0.5
     left_of = np.concatenate([np.zeros((1, own)), np.cumsum(np.eye(own), axis=0)])
-    between = make_interp_spline(edges, left_of, k=1 if even or own < 3 else 3)
+    between = scipy.interpolate.make_interp_spline(edges, left_of, k=1 if even or own < 3 else 3)
     centres = (np.arange(wanted) - wanted // 2) * ratio
     upper, lower = (between((centres + side * ratio * active / 2).clip(edges[0], edges[-1])) for side in (1, -1))
     return torch.as_tensor((upper - lower) / active)

@@ -9,6 +9,7 @@ from operator import mul
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from torch import Tensor
 
@@ -53,9 +54,8 @@ def _bessel(order: int, x: Tensor) -> Tensor:
     """J0 or J1. On a CPU by scipy in as much time: torch's are off by 4e-7 at x = 5."""
     if x.device.type != "cpu" or x.dtype != torch.float64:
         return (torch.special.bessel_j0, torch.special.bessel_j1)[order](x)
-    from scipy.special import j0, j1  # imported late
-
-    return torch.as_tensor((j0, j1)[order](x.detach().numpy()))
+    bessel = (scipy.special.j0, scipy.special.j1)[order]
+    return torch.as_tensor(bessel(x.detach().numpy()))
 
 
 class BesselJ0(torch.autograd.Function):
@@ -168,11 +168,9 @@ def legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
 
     By scipy, of a banded matrix: numpy's full one takes a second a rule where another process keeps a core from it.
     """
-    from scipy.special import roots_legendre  # imported late
-
     panels = math.ceil(count / MOST_NODES)
     order = count if panels == 1 else math.ceil(count / panels) + 32
-    nodes, weights = roots_legendre(order)
+    nodes, weights = scipy.special.roots_legendre(order)
     centres = (2 * np.arange(panels) + 1) / panels - 1
     return (centres[:, None] + nodes / panels).ravel(), np.tile(weights / panels, panels)
 

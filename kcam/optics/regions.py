@@ -6,8 +6,8 @@ Depth layers are one partition of a picture with shares that sum to 1, zones of 
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial import Delaunay
 from torch import Tensor
 
 _AT_ONCE = 2**16  # places beyond the nodes
@@ -50,7 +50,7 @@ def _along(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _scattered(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
-    mesh = Delaunay(nodes)
+    mesh = scipy.spatial.Delaunay(nodes)
     inside = mesh.find_simplex(places)
     weights = np.zeros((len(places), len(nodes)))
     beyond = np.flatnonzero(inside < 0)

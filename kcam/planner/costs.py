@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import Any, TypedDict
 
 import numpy as np
+import scipy
 import torch
 
 from kcam import files, measure, optics
@@ -99,8 +100,6 @@ def calibrate(*, rounds: int = 3, advance: Callable[[str, int], None] | None = N
                advance: told what is being measured, and how many pictures there are.
     Returns:   (kind -> seconds for one operation, the median factor by which they mispredict those pictures).
     """
-    from scipy.optimize import nnls  # imported late: few calibrate
-
     works, times = [], []
     pictures = list(_pictures())
     for name, imaging, scene, colours in pictures:
@@ -119,7 +118,7 @@ def calibrate(*, rounds: int = 3, advance: Callable[[str, int], None] | None = N
     kinds = [kind for kind in RATES if any(kind in work.operations for work in works)]
     counts = np.array([[work.operations.get(kind, 0.0) for kind in kinds] for work in works]) / np.array(times)[:, None]
     scale = counts.max(axis=0)
-    solution = nnls(counts / scale, np.ones(len(times)))[0] / scale
+    solution = scipy.optimize.nnls(counts / scale, np.ones(len(times)))[0] / scale
     # what took no time beside the others keeps a small rate: a price of nothing would be chosen without end
     fitted = {kind: float(max(rate, 0.02 * RATES[kind])) for kind, rate in zip(kinds, solution, strict=True)}
     rates = RATES | fitted

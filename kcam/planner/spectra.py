@@ -17,8 +17,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import scipy
 import torch
-from scipy.fft import dctn, rfftn
 from torch import Tensor
 
 from kcam.camera import Camera
@@ -384,10 +384,11 @@ def _crossed(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
     """
     size = [2 * n for n in planes.shape[-2:]]
     if dark:
-        spectrum = torch.view_as_real(torch.as_tensor(rfftn(planes.cpu().numpy(), s=size, axes=(-2, -1), norm="ortho")))
+        found = scipy.fft.rfftn(planes.cpu().numpy(), s=size, axes=(-2, -1), norm="ortho")
+        spectrum = torch.view_as_real(torch.as_tensor(found))
         fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64).abs(), torch.fft.rfftfreq(size[1], dtype=torch.float64)
     else:
-        spectrum = torch.as_tensor(dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
+        spectrum = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
         fy, fx = (torch.arange(n // 2, dtype=torch.float64) / n for n in size)
     radius = torch.hypot(fy[:, None], fx)
     ring = torch.bucketize(radius.flatten(), (frequencies[1:] + frequencies[:-1]) / 2)

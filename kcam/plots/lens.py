@@ -9,9 +9,9 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import scipy
 import torch
 from matplotlib.figure import Figure
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from kcam.optics import CompoundLens
@@ -413,7 +413,7 @@ def _draw_curves(sheet: Sheet, curves: FieldCurves, top: float) -> None:
 
     def drawn(axes: Any, curve: Tensor, **style: Any) -> None:
         values = curve.detach().numpy()
-        smooth = PchipInterpolator(at, values)(between) if len(at) > 1 else values
+        smooth = scipy.interpolate.PchipInterpolator(at, values)(between) if len(at) > 1 else values
         axes.plot(between if len(at) > 1 else at, smooth, lw=1.5, **style)
 
     panels = [sheet.axes(_left(column), top, _CELL, _CELL) for column in range(5)]

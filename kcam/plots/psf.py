@@ -8,9 +8,9 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import scipy
 import torch
 from matplotlib.figure import Figure
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from kcam import optics, spectral
@@ -138,7 +138,7 @@ def psf_figure(
     disc = {"pixel_pitch": reach * pitch / count, "shape": (2 * count + 1, 2 * count + 1)}
     light = lens.encircled_energy(middle[None], **(arguments | disc))[:, 0].detach().cpu()
     between = np.linspace(0, reach * pitch, 401)  # a monotone cubic through the radii: a few of them make corners
-    smooth = PchipInterpolator(radii.double().numpy(), light.double().numpy(), axis=1)(between)
+    smooth = scipy.interpolate.PchipInterpolator(radii.double().numpy(), light.double().numpy(), axis=1)(between)
     for index, distance in enumerate(distances):
         style = {"color": curve_colours[index], "lw": 1.6, "label": metres(distance)}
         contrast.plot(frequencies / 1e3, mtf[index], **style)

@@ -15,6 +15,7 @@ import functools
 import math
 from typing import NamedTuple
 
+import scipy
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -91,8 +92,6 @@ def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
     >>> fit.coefficients.shape, max(fit.errors) < 0.02
     (torch.Size([3, 12]), True)
     """
-    from scipy.optimize import nnls  # comes with scikit-image; imported late, since few users need it
-
     grid = wavelength_grid(wavelengths)
     if not isinstance(curves, Tensor) or curves.ndim != 2 or curves.shape[1] != len(grid) or not len(curves):
         got = tuple(curves.shape) if isinstance(curves, Tensor) else type(curves).__name__
@@ -111,7 +110,7 @@ def fit_gaussians(curves: Tensor, *, wavelengths: Tensor) -> GaussianFit:
         alpha = torch.zeros(len(given), BASIS_SIZE, dtype=torch.float64)
         reached = basis.amax(1) >= _REACH * basis.max()
         for row, curve in zip(alpha, given.numpy(), strict=True):
-            row[reached] = torch.from_numpy(nnls(basis[reached].T.numpy(), curve)[0])
+            row[reached] = torch.from_numpy(scipy.optimize.nnls(basis[reached].T.numpy(), curve)[0])
         alpha = alpha / (alpha @ basis)[green].max()
         return GaussianFit(alpha, width, tuple((alpha @ basis - given).square().mean(1).sqrt().tolist()))
 

@@ -15,8 +15,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.interpolate import BarycentricInterpolator
 from torch import Tensor
 
 from kcam.optics.compound.pupil import PupilFit
@@ -136,7 +136,7 @@ def _from_chebyshev(degree: int, count: int) -> tuple[Tensor, Tensor]:
     """Chebyshev points of (-1, 1), and what takes a polynomial's values there to `count` nodes: (count, degree + 1)."""
     points = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     nodes = (np.arange(count) + 0.5) * 2 / count - 1
-    matrix = BarycentricInterpolator(points, np.eye(degree + 1))(nodes)
+    matrix = scipy.interpolate.BarycentricInterpolator(points, np.eye(degree + 1))(nodes)
     return torch.as_tensor(points), torch.as_tensor(matrix)
 
 

@@ -11,8 +11,8 @@ import re
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from kcam.inputs import describe
@@ -103,7 +103,7 @@ class MeasuredPupil(Element):
         closed = ~open_part & (rho <= 1 - 2 / count)
         if not closed.any():
             return cls(opd, width=diameter)
-        nearest = ndimage.distance_transform_edt(rho > 1 - 2 / count, return_distances=False, return_indices=True)
+        nearest = scipy.ndimage.distance_transform_edt(rho > 1 - 2 / count, return_distances=False, return_indices=True)
         return cls(opd, amplitude=torch.from_numpy(1.0 - closed[tuple(nearest)]), width=diameter)
 
     def check(self) -> None:
@@ -174,7 +174,7 @@ def _extrapolated(values: np.ndarray) -> np.ndarray:
     legendre = np.polynomial.legendre.legvander(side, degree)
     basis = np.stack([legendre[:, i, None] * legendre[None, :, j] for i, j in powers], axis=-1)
     fitted = basis @ np.linalg.lstsq(basis[known], values[known], rcond=None)[0]
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return np.where(known, values, fitted + (values - fitted)[tuple(nearest)])
 
 
@@ -266,7 +266,7 @@ def _centred(waves: np.ndarray, column: int, row: int) -> tuple[np.ndarray, np.n
     Zemax puts n / 2 - 1 samples from the centre to the rim, others n / 2: what is not 0 fills one of these circles.
     """
     count = len(waves)
-    open_part = ~ndimage.binary_opening(np.pad(waves == 0, 2, constant_values=True), np.ones((3, 3)))[2:-2, 2:-2]
+    open_part = ~scipy.ndimage.binary_opening(np.pad(waves == 0, 2, constant_values=True), np.ones((3, 3)))[2:-2, 2:-2]
     open_part |= not open_part.any()  # of a perfect wavefront
     lines = np.hypot(*np.meshgrid(np.arange(count) - column, np.arange(count) - row))
     radius = min((count // 2, (count - 1) // 2), key=lambda r: abs(float((lines <= r).sum()) - float(open_part.sum())))

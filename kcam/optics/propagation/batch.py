@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from numbers import Integral
 
 import numpy as np
+import scipy
 import torch
-from scipy.special import fresnel
 from torch import Tensor
 
 from kcam.inputs import as_values, describe
@@ -300,7 +300,8 @@ class _Fresnel(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rim, chord):
         scale = math.sqrt(2 * max(abs(float(rim)), 1e-12) / math.pi)
-        sine, cosine = (torch.as_tensor(part, device=chord.device) for part in fresnel(chord.cpu().numpy() * scale))
+        parts = scipy.special.fresnel(chord.cpu().numpy() * scale)
+        sine, cosine = (torch.as_tensor(part, device=chord.device) for part in parts)
         result = torch.complex(cosine, sine if rim > 0 else -sine) / scale
         ctx.save_for_backward(rim, chord, result)
         return result

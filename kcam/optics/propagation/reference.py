@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
-from scipy import special
 from torch import Tensor
 
 from kcam.optics.propagation.grid import grid_psf, matrix_cost
@@ -129,7 +129,7 @@ def _closed_form_error(spots: Query) -> float:
 def _jinc(v: np.ndarray) -> np.ndarray:
     """2 J1(v) / v."""
     safe = np.where(v == 0, 1, v)
-    return np.where(v == 0, 1.0, 2 * special.j1(safe) / safe)
+    return np.where(v == 0, 1.0, 2 * scipy.special.j1(safe) / safe)
 
 
 REFERENCE = Propagator(

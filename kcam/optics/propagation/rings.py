@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.special import erfc
 from torch import Tensor
 
 from kcam.optics.numerics import MOST_NODES, legendre, phasor
@@ -149,7 +149,7 @@ def scatter(edges: Tensor, phase: Callable[[Tensor], Tensor]) -> Scatter:
         if resolved or count == _MOST_SPECTRUM:
             break
         count *= 2
-    fade = torch.as_tensor(erfc((radius.cpu().numpy() - 0.65) / 0.1)).to(radius)
+    fade = torch.as_tensor(scipy.special.erfc((radius.cpu().numpy() - 0.65) / 0.1)).to(radius)
     field = phasor(angle) * fade
     diameter = torch.cat([field, field.new_zeros(field.shape[0], 1), field[:, 1:].flip(-1)], dim=-1)
     power = torch.fft.fft(diameter)[:, : count + 1].abs().square()

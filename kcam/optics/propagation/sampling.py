@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 import torch
-from scipy.special import sici
 from torch import Tensor
 
 from kcam.optics.pupil.coordinates import EDGE_MARGIN
@@ -81,7 +81,8 @@ def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0)
     centres = np.arange(pixels) - pixels // 2
     beyond = 0 if float(per_pixel).is_integer() else _CONTINUED
     points = np.arange(-reach - beyond, reach + beyond + 1)
-    upper, lower = (sici(np.pi * ((centres[:, None] + side * active / 2) * per_pixel - points))[0] for side in (1, -1))
+    ends = (np.pi * ((centres[:, None] + side * active / 2) * per_pixel - points) for side in (1, -1))
+    upper, lower = (scipy.special.sici(end)[0] for end in ends)
     box = (upper - lower) / (np.pi * per_pixel * active)
     if beyond:  # the tails of a sinc between the points: the outermost value continues, instead of an edge to darkness
         box[:, beyond] += box[:, :beyond].sum(1)

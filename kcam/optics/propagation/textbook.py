@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import scipy
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -41,7 +41,7 @@ def textbook_psf(query: Query, *, samples: int, points: int = 1) -> Tensor:
         r2 = axis[:, None] ** 2 + axis**2
         fields = fields * phasor(2 * math.pi / wavelength * r2 / (2 * d))  # the chirp inside the integral of (3.4)
         per_pixel = wavelength * float(d) / step / (query.pixel_pitch / points)
-        length = next_fast_len(math.ceil(math.ceil(samples / per_pixel) * per_pixel), real=False)
+        length = scipy.fft.next_fast_len(math.ceil(math.ceil(samples / per_pixel) * per_pixel), real=False)
         _check_length(length)
         density = torch.stack([squared(torch.fft.fft2(field, s=(length, length))) for field in fields])
         density = torch.fft.fftshift(density, dim=(-2, -1)) * step**4 / (wavelength * d) ** 2
@@ -60,9 +60,9 @@ def textbook_angular_spectrum(query: Query, *, points: int = 1) -> Tensor:
     """
     a, d = float(query.semi_aperture.detach()), float(query.sensor_distance.detach())
     pitch = query.pixel_pitch / points
-    count = next_fast_len(math.ceil(1.1 * 2 * (a + query.half_window) / pitch), real=False)
+    count = scipy.fft.next_fast_len(math.ceil(1.1 * 2 * (a + query.half_window) / pitch), real=False)
     while (count - points) % 2:  # a pixel's centre is the middle one of its points, or between them
-        count = next_fast_len(count + 1, real=False)
+        count = scipy.fft.next_fast_len(count + 1, real=False)
     _check_length(count)
     axis = (torch.arange(count, dtype=torch.float64, device=query.device) - (count - 1) / 2) * pitch
     frequency = torch.fft.fftfreq(count, pitch, dtype=torch.float64, device=query.device)
