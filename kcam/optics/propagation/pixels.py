@@ -47,14 +47,15 @@ class Pixels:
 
     def of_quadrant(self, quadrant: Tensor) -> Tensor:
         """(..., H, W) of an intensity that is even in x and y, given for x, y >= 0: (..., J + 1, K + 1)."""
-        own = [abs(i - n // 2) for n in self.shape for i in range(n)]  # which pixel of the quadrant each one repeats
         pixels = quadrant
         if self.integrate:
             reaches = (length - 1 for length in quadrant.shape[-2:])
             even = (2 * _halves(n, **self._how(k, quadrant))[0] for n, k in zip(self.shape, reaches, strict=True))
             pixels = apply_linear(quadrant, _Products(*even))
-        height = self.shape[0]
-        return self._scaled(pixels[..., own[:height], :][..., own[height:]], lambda same: same.of_quadrant(quadrant))
+        for axis, n in ((-1, self.shape[1]), (-2, self.shape[0])):  # each pixel of the quadrant stands on both sides
+            mirrored = pixels.narrow(axis, 1, n // 2).flip(axis)
+            pixels = torch.cat([mirrored, pixels.narrow(axis, 0, n - n // 2)], dim=axis)
+        return self._scaled(pixels, lambda same: same.of_quadrant(quadrant))
 
     def of_quadrants(self, quadrants: Tensor) -> Tensor:
         """(..., H, W) of the intensity as `split` gives it, (..., 4, K + 1, K + 1)."""
