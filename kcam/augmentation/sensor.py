@@ -72,11 +72,11 @@ class RandomBayer(CameraAugmentation):
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Each pattern's rows at once."""
-        result = signal.new_zeros(len(signal), self.output_channels(signal.shape[1]), *signal.shape[2:])
-        for index in drawn["pattern"].unique().tolist():
-            rows = (drawn["pattern"] == index).nonzero().flatten().to(signal.device)
-            result = result.index_copy(0, rows, self._one(signal[rows], self.patterns[index]))
-        return result
+        order = drawn["pattern"].argsort(stable=True)
+        found, counts = drawn["pattern"].unique(return_counts=True)
+        sorted_rows = signal.index_select(0, order.to(signal.device)).split(counts.tolist())
+        parts = [self._one(rows, self.patterns[index]) for rows, index in zip(sorted_rows, found.tolist(), strict=True)]
+        return torch.cat(parts).index_select(0, order.argsort().to(signal.device))
 
     def _one(self, signal: Tensor, pattern: str) -> Tensor:
         if is_picture(signal):

@@ -325,7 +325,7 @@ def _encode(signal: Tensor) -> Tensor:
 
 def _decode(signal: Tensor) -> Tensor:
     root = SQRT_OFFSET**0.5
-    return torch.where(signal > 0, signal * (signal + 2 * root), signal * (2 * root))
+    return signal * (signal.clamp(min=0) + 2 * root)
 
 
 DOMAINS: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]] = {
