@@ -148,6 +148,7 @@ class Checked:
         **kwargs: Any,
     ) -> Tensor:
         """Kornia's, without its choice between two whole batches: `on_drawn_rows` leaves the other rows as they are.
+        What comes with channels last in memory goes so.
 
         torch.compile must not ask which rows were drawn: there all are transformed, and Kornia chooses.
         """
@@ -158,6 +159,8 @@ class Checked:
         batch = own.transform_tensor(input)
         own.validate_tensor(batch)
         output = own.apply_transform(batch, params, flags, transform=transform)
+        if batch.is_contiguous(memory_format=torch.channels_last) and not batch.is_contiguous():
+            output = output.contiguous(memory_format=torch.channels_last)
         return own.transform_output_tensor(output, input.shape)
 
 

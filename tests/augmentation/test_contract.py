@@ -101,6 +101,14 @@ class TestShapes:
         augment = case(p=1.0)
         torch.testing.assert_close(seeded(augment, x), seeded(augment, x.contiguous()), atol=1e-6, rtol=0)
 
+    @table()
+    @pytest.mark.parametrize("p", [1.0, 0.5])
+    def test_channels_last_in_channels_last_out(self, case: Case, p: float) -> None:
+        x, augment = picture(4, 3, *SIZE), case(p=p)
+        y = seeded(augment, x.contiguous(memory_format=torch.channels_last))
+        assert y.is_contiguous(memory_format=torch.channels_last)
+        torch.testing.assert_close(y, seeded(augment, x), atol=1e-6, rtol=0)
+
     @table(lambda case: case.cubes)
     def test_cubes_far_above_white_and_below_black(self, case: Case) -> None:
         assert case(p=1.0)(picture(2, 28, *SIZE) * 50 - 10).isfinite().all()
