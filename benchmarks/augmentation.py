@@ -3,15 +3,20 @@
     python -m benchmarks.augmentation [--quick] [--only NAME] [--out benchmarks/results/augmentation.json]
 
 All contestants of a race run by turns in one process. *Ours* is the augmentation as it is called, *simulate* its
-effect alone on drawn numbers, *light* the way of a whole picture into linear light and back, *identity* a Kornia
-augmentation that returns its input. The maths is simulate, and light where the effect wants it; the straightforward way
-needs both too. What we add is ours - identity - maths: drawing, picking rows, checks, copies. The claim: it costs
-less than the maths; what comes out where light does not count as maths is written down too.
+effect alone on drawn numbers, *light* the way of a whole picture into linear light and back, *two powers* what that
+way would take at least, x^2.4 and x^(1/2.4), *identity* a Kornia augmentation that returns its input. The maths is
+simulate, and light where the effect wants it; the straightforward way needs both too. What we add is ours - identity -
+maths: drawing, picking rows, checks, copies. The claim: it costs less than the maths; what comes out where light does
+not count as maths is written down too. `AIMS` says how much longer than Kornia's each may take. Then four of them in a
+row, and a pipeline of eight stages behind a DataLoader.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
+import statistics
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,10 +43,6 @@ from kcam.units import wavelength_grid
 RESULTS = Path(__file__).parent / "results" / "augmentation.json"
 SEED = 3  # draws four of eight rows at p = 0.5
 BATCH, SIDE, CHANNELS = 8, 256, (3, 28)
-
-Plain = Callable[[Any, Tensor, dict[str, Tensor]], Tensor]
-Make = Callable[[float], nn.Module]
-
 
 Plain = Callable[[Any, Tensor, dict[str, Tensor]], Tensor]
 Make = Callable[[float], Any]
@@ -169,6 +170,13 @@ def noise_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tenso
     return ((counts + sigma * torch.randn_like(signal)) / scale).clamp(max=1)
 
 
+def normal_noise_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """torch.randn of all samples at once, with the variance of photons and read-out."""
+    gain, well, sigma = (drawn[name].to(signal)[:, None, None, None] for name in ("iso", "full_well", "read_noise"))
+    electron = gain / 100 / well
+    return (signal + (signal * electron + (electron * sigma) ** 2).sqrt() * torch.randn_like(signal)).clamp(max=1)
+
+
 def pattern_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
     """torch.randn twice, of all samples at once."""
     prnu, dsnu = (drawn[name].to(signal)[:, None, None, None] for name in ("prnu", "dsnu"))
@@ -274,6 +282,7 @@ def fisheye(p: float) -> nn.Module:
     return K.RandomFisheye(torch.tensor([-0.1, 0.1]), torch.tensor([-0.1, 0.1]), torch.tensor([0.9, 1.1]), p=p)
 
 
+NORMAL_NOISE = functools.partial(KC.RandomShotReadNoise, photons="normal")
 GAUSSIAN: dict[str, Make] = {"RandomGaussianBlur": blur}
 MOTION: dict[str, Make] = {"RandomMotionBlur": lambda p: K.RandomMotionBlur((21, 35), 35.0, 0.5, p=p)}
 NOISE: dict[str, Make] = {"RandomGaussianNoise": lambda p: K.RandomGaussianNoise(p=p)}
@@ -291,6 +300,7 @@ CASES: dict[str, Case] = {
     "RandomLens": Case(KC.RandomLens, real_lens_per_sample, {}, share=1 / BATCH, only=(3,)),
     "RandomBayer": Case(KC.RandomBayer, bayer_per_sample, {"rgb_to_raw, raw_to_rgb": bayer}, relative_only=(3,)),
     "RandomShotReadNoise": Case(KC.RandomShotReadNoise, noise_of_the_batch, NOISE, exact=False),
+    "RandomShotReadNoise, normal": Case(NORMAL_NOISE, normal_noise_of_the_batch, NOISE, exact=False),
     "RandomFixedPattern": Case(KC.RandomFixedPattern, pattern_of_the_batch, NOISE, exact=False),
     "RandomExposure": Case(
         KC.RandomExposure, exposure_per_sample, {"RandomBrightness": lambda p: K.RandomBrightness((0.5, 1.5), p=p)}
@@ -315,6 +325,105 @@ CASES: dict[str, Case] = {
     ),
     "RandomCamera": Case(KC.RandomCamera, camera_per_sample, {}, exact=False, share=1 / BATCH),
 }
+
+
+@dataclass(frozen=True)
+class Aim:
+    """So many times as long as another contestant an augmentation may take, on pictures at p = 1."""
+
+    name: str
+    beside: str
+    most: float
+
+    def verdict(self, lines: list[dict[str, Any]]) -> dict[str, Any]:
+        """What was measured, beside the aim."""
+        seconds = next(line["seconds"] for line in lines if line["augmentation"] == self.name and line["channels"] == 3)
+        ratio = seconds["kcam 1"] / seconds[self.beside]
+        return {"what": self.name, "beside": self.beside, "most": self.most, "ratio": ratio, "met": ratio <= self.most}
+
+
+POWERS = "two powers"
+AIMS = (
+    *(Aim(f"Random{name}", POWERS, 1.2) for name in ("Exposure", "WhiteBalance", "Vignetting", "Quantisation")),
+    Aim("RandomToneCurve", "RandomGamma", 1.2),
+    Aim("RandomShotReadNoise", "RandomGaussianNoise", 5.0),
+    Aim("RandomShotReadNoise, normal", "RandomGaussianNoise", 3.0),
+    Aim("RandomLensDistortion", "RandomFisheye", 2.0),
+    Aim("RandomDefocus", "RandomGaussianBlur", 1.5),
+    Aim("RandomDiffraction", "RandomGaussianBlur", 2.0),
+    Aim("RandomAberration", "RandomGaussianBlur", 3.0),
+    Aim("RandomBayer", "rgb_to_raw, raw_to_rgb", 1.2),
+)
+RUN = (
+    (KC.RandomExposure, "RandomExposure"), (KC.RandomWhiteBalance, "RandomWhiteBalance"),
+    (KC.RandomVignetting, "RandomVignetting"), (KC.RandomQuantisation, "RandomQuantisation"),
+)  # fmt: skip
+"""In a row, which takes a picture into light once; the first relative of each stands beside it."""
+PIPELINE = (
+    KC.RandomLensDistortion, KC.RandomDefocus, KC.RandomVignetting, KC.RandomBayer, KC.RandomShotReadNoise,
+    KC.RandomExposure, KC.RandomWhiteBalance, KC.RandomToneCurve,
+)  # fmt: skip
+
+
+def relative_of(name: str, p: float) -> nn.Module:
+    """The first of Kornia's nearest."""
+    return next(iter(CASES[name].relatives.values()))(p)
+
+
+def run(*, batch: int, side: int, seconds: float) -> list[dict[str, Any]]:
+    """Times of the first one to four of `RUN`, ours in a CameraSequential and Kornia's in its container."""
+    picture = torch.rand(batch, 3, side, side, generator=torch.Generator().manual_seed(1))
+    contestants = []
+    for count in range(1, len(RUN) + 1):
+        theirs = K.AugmentationSequential(*(relative_of(name, 1.0) for _, name in RUN[:count]))
+        ours = KC.CameraSequential(*(augmentation(p=1.0) for augmentation, _ in RUN[:count]))
+        contestants += [
+            Contestant(f"Kornia {count}", functools.partial(theirs, picture), no_error),
+            Contestant(f"kcam {count}", functools.partial(ours, picture), no_error),
+        ]
+    with torch.no_grad():
+        rows = race("run", size="", direction="forward", contestants=contestants, seconds=seconds)
+    taken = {row["who"]: row["seconds"] for row in rows}
+    lines = []
+    for count, (_, name) in enumerate(RUN, start=1):
+        more = {who: taken[f"{who} {count}"] - taken.get(f"{who} {count - 1}", 0.0) for who in ("kcam", "Kornia")}
+        lines.append({"count": count, "last": name, "seconds": [taken[f"kcam {count}"], taken[f"Kornia {count}"]],
+                      "more": [more["kcam"], more["Kornia"]]})  # fmt: skip
+    return lines
+
+
+class Pictures(torch.utils.data.Dataset):
+    """Random ones, the same each time."""
+
+    def __init__(self, count: int, side: int) -> None:
+        self.pictures = torch.rand(count, 3, side, side, generator=torch.Generator().manual_seed(1))
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def __getitem__(self, index: int) -> Tensor:
+        return self.pictures[index]
+
+
+def pipeline(*, batch: int, side: int, batches: int, rounds: int) -> dict[str, Any]:
+    """Seconds on the wall of eight stages at p = 0.5 in two workers of one thread, by turns with Kornia's nearest."""
+    theirs = K.AugmentationSequential(*(relative_of(augmentation.__name__, 0.5) for augmentation in PIPELINE))
+    ours = KC.CameraSequential(*(augmentation(p=0.5) for augmentation in PIPELINE))
+    taken: dict[str, list[float]] = {"kcam": [], "Kornia": []}
+    for _ in range(rounds):
+        for who, augment in (("Kornia", theirs), ("kcam", ours)):
+            loader = torch.utils.data.DataLoader(
+                Pictures(batch * batches, side), batch_size=batch, num_workers=2, persistent_workers=True,
+                collate_fn=lambda rows, augment=augment: augment(torch.stack(rows)),
+                worker_init_fn=lambda _: torch.set_num_threads(1),
+            )  # fmt: skip
+            list(loader)  # workers start, tables are built
+            before = time.perf_counter()
+            list(loader)
+            taken[who].append((time.perf_counter() - before) / batches)
+    seconds = {who: statistics.median(each) for who, each in taken.items()}
+    names = [augmentation.__name__ for augmentation in PIPELINE]
+    return {"size": f"{batch} x 3 x {side}^2", "stages": names, "p": 0.5, "workers": 2, "seconds_per_batch": seconds}
 
 
 def half_of_the_rows(batch: int) -> int:
@@ -364,6 +473,7 @@ def compare(name: str, case: Case, *, channels: int, batch: int, side: int, seco
                 contestants += [Contestant(who, seeded(make(p)), no_error) for who, make in case.relatives.items()]
             if coded:
                 contestants.append(Contestant("light", lambda: tone_curve(to_light(picture)), no_error))
+                contestants.append(Contestant("two powers", lambda: (picture**2.4, picture ** (1 / 2.4)), no_error))
         contestants += [
             Contestant(f"kcam {p:g}", seeded(own), no_error, default=p == 1),
             Contestant(f"kcam simulate {p:g}", lambda a=own, s=light, d=drawn: simulate(a, s, d), no_error),
@@ -455,7 +565,18 @@ def main(arguments: list[str] | None = None) -> int:
                 shares = ", ".join(f"p={p}: {found['share_of_maths']:.2f}" for p, found in line["added"].items())
                 console.print(f"[bold]{line['augmentation']}[/] {line['size']}: ms: {times}; we add {shares}")
     if not options.only:
-        write_json(options.out, {"environment": environment(), "lines": lines})
+        few = {"batch": sizes["batch"], "side": sizes["side"]}
+        with threads.fixed(1), torch.random.fork_rng():
+            found = {
+                "aims": [aim.verdict(lines) for aim in AIMS],
+                "run": run(**few, seconds=4 * sizes["seconds"]),
+                "pipeline": pipeline(
+                    batch=2 * sizes["batch"], side=sizes["side"], batches=2 if options.quick else 8,
+                    rounds=1 if options.quick else 5,
+                ),
+            }  # fmt: skip
+        console.print(found)
+        write_json(options.out, {"environment": environment(), "lines": lines, **found})
     return 0
 
 

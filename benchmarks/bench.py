@@ -12,6 +12,7 @@ the float64 per-band picture for rendering.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,8 +23,10 @@ import numpy as np
 import oracles
 import torch
 from rich.console import Console
+from scipy.fft import next_fast_len
 from torch import Tensor, nn
 
+from benchmarks import whole
 from benchmarks.baselines import doe_scale, per_band_render, textbook_psf_bank, transfer_functions
 from benchmarks.common import ROOT, Contestant, environment, print_table, race, write_json
 from kcam import optics, sensor
@@ -253,6 +256,42 @@ def smooth_rows(sizes: Sizes, *, distance: float, integrate: bool, backward: boo
         direction="forward + backward" if backward else "forward",
         contestants=contestants,
         seconds=sizes.seconds,
+    )
+
+
+def one_psf_rows(sizes: Sizes) -> Rows:
+    """One PSF of the singlet, again by the same lens, and by a lens that was focused anew, as a training step does."""
+    case = Singlet(replace(sizes, bands=1), 0.5, integrate=False)
+    truth = case.truth()
+    lens, steps = case.lens(case.radius), itertools.count()
+
+    def focused_anew() -> Tensor:
+        moved = case.lens(case.radius)
+        moved.sensor_distance = case.sensor_distance + 1e-9 * next(steps)
+        return case.ours(moved, method="radial")
+
+    def check(result: Any) -> dict[str, float]:
+        return relative_l1(result, truth)
+
+    return race(
+        "one PSF",
+        size=f"{sizes.window}^2",
+        direction="forward",
+        contestants=[
+            Contestant(
+                "textbook",
+                lambda: without_gradient(
+                    lambda: case.textbook(torch.tensor(case.radius), oversample=1, members=torch.arange(1))
+                ),
+                check,
+                dtype="float64",
+            ),
+            Contestant(
+                "kcam radial", lambda: without_gradient(lambda: case.ours(lens, method="radial")), check, default=True
+            ),
+            Contestant("kcam radial, focused anew", lambda: without_gradient(focused_anew), check),
+        ],
+        seconds=sizes.seconds / 2,
     )
 
 
@@ -501,10 +540,24 @@ def render_rows(sizes: Sizes, scene: Scene, *, kind: str) -> Rows:
                 contestants=[
                     Contestant("textbook per band", calls[0], check),
                     Contestant("kcam Imaging", calls[1], check, default=True),
+                    *([Contestant("bare FFTs", lambda: bare_transforms(bands, sizes.window), no_error)]
+                      if direction == "forward" and kind == "cube" else []),
                 ],
                 seconds=sizes.seconds / 2,
             )
     return rows
+
+
+def bare_transforms(bands: Tensor, window: int) -> list[Tensor]:
+    """A transform of each band of (1, L, H, W) and back of three channels, plane by plane, at the least good length."""
+    size = [next_fast_len(n + window - 1, real=True) for n in bands.shape[-2:]]
+    spectra = [torch.fft.rfft2(band, s=size) for band in bands[0]]
+    return [torch.fft.irfft2(spectrum, s=size) for spectrum in spectra[:3]]
+
+
+def no_error(result: Any) -> dict[str, float]:
+    """It is no picture."""
+    return {}
 
 
 def random_scene(sizes: Sizes, *, picture: int) -> Scene:
@@ -532,13 +585,25 @@ class Target:
     faster: float
     lower_error: float = 0.0
     same_to: float = math.inf
+    direction: str = ""
+    who: str = ""
+    than: str = ""
 
     def judge(self, rows: Rows) -> list[dict[str, Any]]:
-        """A verdict for each op and direction, on the method that kcam takes unless told."""
+        """A verdict for each op and direction, on the method that kcam takes unless told, or on `who`: how much faster
+        it is than the baseline, or than another contestant.
+        """
         verdicts = []
         for row in rows:
-            if not (row["op"].startswith(self.op) and row["default"] and row["error"]):
+            chosen = row["who"] == self.who if self.who else row["default"] and bool(row["error"])
+            if not (row["op"].startswith(self.op) and chosen and self.direction in ("", row["direction"])):
                 continue
+            if self.than:
+                race_of = [other for other in rows if all(other[key] == row[key] for key in ("op", "direction"))]
+                other = next((other for other in race_of if other["who"] == self.than), None)
+                if other is None:
+                    continue
+                row = row | {"ratio": other["seconds"] / row["seconds"], "error_ratio": None}
             met = row["ratio"] >= self.faster and (row["error_ratio"] or math.inf) >= self.lower_error
             met = met and all(row["error"].get(kind, 0) <= self.same_to for kind in ("relative_max", "gradient"))
             verdict = {"target": self.what, "met": met}
@@ -549,6 +614,16 @@ class Target:
 TARGETS = (
     Target("smooth pupil: >= 30 times faster at >= 50 times lower error", "smooth", 30, lower_error=50),
     Target("trainable DOE: >= 8 times faster", "DOE", 8),
+    Target("DOE, 1 distance, points: >= 10 times faster", "DOE, 1 distance, points", 10, direction="forward"),
+    Target(
+        "DOE, 1 distance, points, with gradient: >= 12 times faster", "DOE, 1 distance, points", 12,
+        direction="forward + backward",
+    ),
+    Target(
+        "nonparaxial with a DOE: <= 1.3 times as long as fresnel", "DOE", 1 / 1.3, who="kcam nonparaxial matrix",
+        than="kcam fresnel matrix",
+    ),
+    Target("full-rank cube: <= 1.3 times as long as its bare FFTs", "render cube", 1 / 1.3, than="bare FFTs"),
     Target("full-rank cube: >= 2 times faster, same to 1e-5", "render cube", 2, same_to=1e-5),
     Target("RGB scene: >= 5 times faster, same to 1e-5", "render RGB", 5, same_to=1e-5),
 )
@@ -576,6 +651,8 @@ def measure(sizes: Sizes, console: Console) -> Rows:
                     continue
                 status.update(f"DOE, {len(distances)} distances, {'pixels' if integrate else 'points'} ...")
                 rows += doe_rows(camera, distances=distances, integrate=integrate, truth=truth)
+        status.update("one PSF ...")
+        rows += one_psf_rows(sizes)
         status.update("rendering a cube ...")
         rows += render_rows(sizes, random_scene(sizes, picture=sizes.picture), kind="cube")
         status.update("rendering an RGB scene ...")
@@ -609,7 +686,8 @@ def main(arguments: list[str] | None = None) -> int:
         console.width = max(console.width, 130)
         rows = measure(QUICK if options.quick else Sizes(), console)
         verdicts = [] if options.quick else [verdict for target in TARGETS for verdict in target.judge(rows)]
-        content = {"environment": environment(), "targets": verdicts, "rows": rows}
+        commands = [] if options.quick else [whole.imports(), whole.megapixels(), whole.shoot()]
+        content = {"environment": environment(), "targets": verdicts, "rows": rows, "commands": commands}
     finally:
         torch.set_num_threads(threads)
     print_table(console, rows)
