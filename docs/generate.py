@@ -547,6 +547,45 @@ def augmentation_speed_table() -> str:
     return "\n".join(lines)
 
 
+def augmentation_aims_table() -> str:
+    """How much longer than something near each may take, and does: what is missed is bold."""
+    content = json.loads(AUGMENTED.read_text())
+    lines = ["| pictures, p = 1 | beside | times as long | aim |", "|---|---|---:|---:|"]
+    for aim in content["aims"]:
+        ratio = figures(aim["ratio"]) if aim["met"] else f"**{figures(aim['ratio'])}**"
+        beside = "the bare powers of the way into light and back" if " " in aim["beside"] else f"`{aim['beside']}`"
+        beside = "Kornia's mosaic and demosaic" if "raw" in aim["beside"] else beside
+        lines.append(f"| `{aim['what']}` | {beside} | {ratio} | {aim['most']:g} |")
+    cubes = [line for line in content["lines"] if line["channels"] > 3 and "0.5" in line["added"]]
+    shares = [line["added"]["0.5"]["share_of_maths"] for line in cubes]
+    run, pipeline = content["run"], content["pipeline"]
+    ours, theirs = (1e3 * pipeline["seconds_per_batch"][who] for who in ("kcam", "Kornia"))
+    steps = ", ".join(f"{figures(1e3 * own)} ({figures(1e3 * other)})" for own, other in (line["more"] for line in run))
+    names = ", ".join(f"`{line['last']}`" for line in run)
+    lines += [
+        "",
+        f"In a `CameraSequential` a picture goes into light once: {names} take {steps} ms one after the other, in "
+        f"brackets Kornia's nearest in its own container. On cubes with p = 0.5 we add {max(0.0, min(shares)):.2f} to "
+        f"{max(shares):.2f} of the maths; the aim was 1. Eight stages ("
+        + ", ".join(f"`{name}`" for name in pipeline["stages"])
+        + f") at p = {pipeline['p']:g} on {pipeline['size'].replace('^2', '²')} in {pipeline['workers']} workers: "
+        f"{figures(ours)} ms a batch on the wall, Kornia's nearest eight {figures(theirs)}.",
+    ]
+    return "\n".join(lines)
+
+
+def commands_table() -> str:
+    """What a user waits for, from benchmarks/results/bench.json; what is missed is bold."""
+    lines = ["| | seconds | beside | aim |", "|---|---:|---|---|"]
+    for row in json.loads((RESULTS / "bench.json").read_text())["commands"]:
+        seconds = figures(row["seconds"]) if row["met"] else f"**{figures(row['seconds'])}**"
+        beside = f"`{row['beside']}` {figures(row['beside_seconds'])}" if "beside" in row else ""
+        if "stages" in row:
+            beside = ", ".join(f"{name} {value:.2f}" for name, value in row["stages"].items())
+        lines.append(f"| {row['what']} | {seconds} | {beside} | {row['aim']} |")
+    return "\n".join(lines)
+
+
 def speed_cells(line: dict[str, Any] | None) -> list[str]:
     """Ours, Kornia's, the plain way, and what we add, met or missed."""
     if line is None:
@@ -856,6 +895,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "benchmarks": benchmarks_table,
     "augmentations": augmentations_table,
     "augmentation_speed": augmentation_speed_table,
+    "augmentation_aims": augmentation_aims_table,
+    "commands": commands_table,
     "segmentation": segmentation_table,
     "formats": formats_table,
     "glasses": glasses_table,

@@ -37,7 +37,7 @@ def test_each_race_has_a_textbook_and_kcam_with_its_default(content):
     for row in content["rows"]:
         races.setdefault((row["op"], row["direction"]), []).append(row)
     assert {direction for _, direction in races} == {"forward", "forward + backward"}
-    assert len(races) == 5 + 6 + 12
+    assert len(races) == 5 + 6 + 1 + 12
     for rows in races.values():
         assert rows[0]["baseline"]
         assert rows[0]["ratio"] == 1
@@ -200,6 +200,30 @@ def test_the_straightforward_way_gives_the_same_picture(augmented):
     for line in exact:
         # measured 6e-6: float32 and the PSFs' sampling, each promised to 1e-4 or better; 0 for most
         assert line["difference"] < 5e-5, line["augmentation"]
+
+
+@pytest.mark.slow
+def test_aims_runs_and_the_pipeline_are_written_down(augmented):
+    names = {line["augmentation"] for line in augmented["lines"]}
+    assert {aim["what"] for aim in augmented["aims"]} <= names
+    assert all(aim["met"] == (aim["ratio"] <= aim["most"]) for aim in augmented["aims"])
+    assert [line["count"] for line in augmented["run"]] == [1, 2, 3, 4]
+    assert augmented["pipeline"]["seconds_per_batch"].keys() == {"kcam", "Kornia"}
+    assert len(augmented["pipeline"]["stages"]) == 8
+
+
+def test_a_target_may_be_beside_another_contestant():
+    rows = [
+        {"op": "cube", "direction": "forward", "who": who, "seconds": seconds, "default": who == "kcam", "ratio": 3.0,
+         "error": {"relative_max": 1e-7}, "error_ratio": None}
+        for who, seconds in (("textbook", 3.0), ("kcam", 1.2), ("floor", 1.0))
+    ]  # fmt: skip
+    (found,) = bench.Target("", "cube", 1 / 1.3, than="floor").judge(rows)
+    assert found["met"]
+    assert found["ratio"] == pytest.approx(1 / 1.2)
+    assert not bench.Target("", "cube", 1 / 1.1, than="floor").judge(rows)[0]["met"]
+    assert bench.Target("", "cube", 2.0, who="nobody").judge(rows) == []
+    assert bench.Target("", "cube", 2.0, direction="backward").judge(rows) == []
 
 
 @pytest.mark.parametrize(
