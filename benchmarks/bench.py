@@ -540,7 +540,7 @@ def render_rows(sizes: Sizes, scene: Scene, *, kind: str) -> Rows:
                 contestants=[
                     Contestant("textbook per band", calls[0], check),
                     Contestant("kcam Imaging", calls[1], check, default=True),
-                    *([Contestant("bare FFTs", lambda: bare_transforms(bands, sizes.window), no_error)]
+                    *([Contestant("bare FFTs", lambda own=own: bare_transforms(bands, sizes.window, kept=own), no_error)]
                       if direction == "forward" and kind == "cube" else []),
                 ],
                 seconds=sizes.seconds / 2,
@@ -548,10 +548,13 @@ def render_rows(sizes: Sizes, scene: Scene, *, kind: str) -> Rows:
     return rows
 
 
-def bare_transforms(bands: Tensor, window: int) -> list[Tensor]:
-    """A transform of each band of (1, L, H, W) and back of three channels, plane by plane, at the least good length."""
+def bare_transforms(bands: Tensor, window: int, *, kept: bool) -> list[Tensor]:
+    """A transform of each band of (1, L, H, W) and back of three channels, plane by plane, at the least good length;
+    unless it is kept, one of each PSF too.
+    """
     size = [next_fast_len(n + window - 1, real=True) for n in bands.shape[-2:]]
-    spectra = [torch.fft.rfft2(band, s=size) for band in bands[0]]
+    psfs = [] if kept else [band[:window, :window] for band in bands[0]]
+    spectra = [torch.fft.rfft2(plane, s=size) for plane in (*bands[0], *psfs)]
     return [torch.fft.irfft2(spectrum, s=size) for spectrum in spectra[:3]]
 
 

@@ -28,6 +28,8 @@ RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
 """Dominant wavelengths of the primaries of sRGB, seen against its white (from CIE 1931 chromaticities)."""
 
 
+_LARGE = 2**20
+"""Numbers of a row: a cube's."""
 TAKES = "(B,C,H,W), a picture in [0,1] or a cube"
 _LEAST, _LARGEST = -0.5, 2.5
 """Of a picture: some beyond 0 and 1 come from other augmentations; from here on it is another scale."""
@@ -171,15 +173,25 @@ def on_drawn_rows(
     effect: Callable[[Tensor, dict[str, Tensor]], Tensor],
     *,
     p: float,
+    alone: bool = False,
 ) -> Tensor:
     """effect(rows, their numbers) of the rows of a batch that were drawn; the others as they are, and at no cost.
 
-    drawn: the numbers of all rows, (B, ...) each.
+    drawn: the numbers of all rows, (B, ...) each. alone: for an effect that costs a few passes over memory, or works
+    row by row anyway, and keeps the channels: large rows are given one by one, so that what it needs on the way stays
+    near, where a batch would take fresh memory for each step.
     """
-    if torch.compiler.is_compiling() or p == 1 or "batch_prob" not in params:
+    if torch.compiler.is_compiling():
         return effect(input, drawn)
-    gate = torch.atleast_1d(params["batch_prob"] > 0.5)
-    if bool(gate.all()):
+    gate = torch.atleast_1d(params["batch_prob"] > 0.5) if p < 1 and "batch_prob" in params else None
+    if alone and len(input) > 1 and input[0].numel() >= _LARGE and input.device.type == "cpu" and is_plain(input):
+        output = torch.empty_like(input)
+        for index, chosen in enumerate([True] * len(input) if gate is None else gate.tolist()):
+            row = slice(index, index + 1)
+            own = {name: value[row] for name, value in drawn.items()} if chosen else {}
+            output[row] = effect(input[row], own) if chosen else input[row]
+        return output
+    if gate is None or bool(gate.all()):
         return effect(input, drawn)
     rows = gate.nonzero().flatten()
     if rows.numel() == 0:
@@ -218,6 +230,8 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
     """Whether `simulate` wants pictures in linear light."""
     takes_depth = False
     """Whether a map of inverse depth matters to it."""
+    alone = False
+    """Whether rows as large as a cube's are better given to `simulate` one by one: see `on_drawn_rows`."""
 
     def __init__(
         self, draws: Mapping[str, Draw], *, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False
@@ -265,7 +279,7 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
         def effect(rows: Tensor, own: dict[str, Tensor]) -> Tensor:
             return simulated(rows, lambda light: self.simulate(light, own), told=params, in_light=self.in_light)
 
-        return on_drawn_rows(input, params, drawn, effect, p=self.p)
+        return on_drawn_rows(input, params, drawn, effect, p=self.p, alone=self.alone)
 
     def _drawn(self, params: dict[str, Any], input: Tensor) -> dict[str, Tensor]:
         """The drawn numbers, (B, ...) each; frames of one clip get their own noise, but the same lens and sensor."""

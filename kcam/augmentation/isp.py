@@ -49,6 +49,8 @@ class RandomWhiteBalance(CameraAugmentation):
     True
     """
 
+    alone = True
+
     def __init__(
         self,
         temperature: Bounds = (4000.0, 10_000.0),
@@ -136,6 +138,7 @@ class RandomToneCurve(CameraAugmentation):
     """
 
     in_light = False
+    alone = True
 
     def __init__(
         self,

@@ -462,6 +462,8 @@ class RandomVignetting(CameraAugmentation):
     (0.56, 0.56)
     """
 
+    alone = True
+
     def __init__(
         self,
         field: Bounds = (20.0, 80.0),

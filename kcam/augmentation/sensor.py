@@ -112,6 +112,8 @@ class RandomShotReadNoise(CameraAugmentation):
     4
     """
 
+    alone = True
+
     def __init__(
         self,
         iso: Bounds = (100.0, 3200.0),
@@ -178,6 +180,8 @@ class RandomFixedPattern(CameraAugmentation):
     0.02
     """
 
+    alone = True
+
     def __init__(
         self,
         prnu: Bounds = (0.0, 0.02),
@@ -219,6 +223,8 @@ class RandomExposure(CameraAugmentation):
     0.686
     """
 
+    alone = True
+
     def __init__(
         self, stops: Bounds = (-1.0, 1.5), *, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False
     ) -> None:
@@ -241,6 +247,8 @@ class RandomQuantisation(CameraAugmentation):
     >>> len(steps.unique())
     4
     """
+
+    alone = True
 
     def __init__(
         self,

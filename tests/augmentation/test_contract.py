@@ -860,3 +860,16 @@ class TestWhatUsersWrite:
         assert set(augment._params["camera"].tolist()) == {0, 1}
         assert y.shape == x.shape
         assert torch.equal(augment(x, params=augment._params), y)
+
+
+@pytest.mark.parametrize("p", [1.0, 0.5])
+def test_large_rows_one_by_one_are_the_batch(p: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = [case for case in CASES if getattr(type(case()), "alone", False) and case.cubes]
+    assert len(alone) >= 6
+    for case in alone:
+        for channels in (3, 28):
+            x, augment = picture(4, channels, *SIZE), case(p=p)
+            whole = seeded(augment, x)
+            with monkeypatch.context() as patch:
+                patch.setattr("kcam.augmentation.base._LARGE", 1)
+                torch.testing.assert_close(seeded(augment, x), whole, atol=1e-6, rtol=0, msg=case.name)
