@@ -84,10 +84,10 @@ class Dispersion(optics.Element):
 def lens_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
     """A Lens and an Imaging for each sample."""
     wavelengths = wavelengths_of(signal, augmentation.wavelengths)
-    window = augmentation.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
     rows = []
     for index in range(len(signal)):
         own = {name: value[index : index + 1] for name, value in drawn.items()}
+        window = augmentation.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths, own)
         row = signal[index : index + 1]
         focal = float(own.get("focal_length", getattr(augmentation, "focal_length", torch.nan)))
         elements = [optics.CircularAperture(focal / float(own["f_number"])), optics.ThinLens(focal)]

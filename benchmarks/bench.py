@@ -533,6 +533,9 @@ def render_rows(sizes: Sizes, scene: Scene, *, kind: str) -> Rows:
                     return {"relative_max": relative_max(result, picture)}
                 return {"relative_max": relative_max(result[0], picture)} | gradient_error(result[1], gradient)
 
+            floor = [
+                Contestant("bare FFTs", lambda kept=own: bare_transforms(bands, sizes.window, kept=kept), no_error)
+            ]
             rows += race(
                 f"render {kind}, {mode}",
                 size=f"{sizes.bands} x {scene.shape[-1]}^2, PSF {sizes.window}^2",
@@ -540,8 +543,7 @@ def render_rows(sizes: Sizes, scene: Scene, *, kind: str) -> Rows:
                 contestants=[
                     Contestant("textbook per band", calls[0], check),
                     Contestant("kcam Imaging", calls[1], check, default=True),
-                    *([Contestant("bare FFTs", lambda own=own: bare_transforms(bands, sizes.window, kept=own), no_error)]
-                      if direction == "forward" and kind == "cube" else []),
+                    *floor[: direction == "forward" and kind == "cube"],
                 ],
                 seconds=sizes.seconds / 2,
             )

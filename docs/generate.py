@@ -574,7 +574,7 @@ def augmentation_aims_table() -> str:
     return "\n".join(lines)
 
 
-def commands_table() -> str:
+def waits_table() -> str:
     """What a user waits for, from benchmarks/results/bench.json; what is missed is bold."""
     lines = ["| | seconds | beside | aim |", "|---|---:|---|---|"]
     for row in json.loads((RESULTS / "bench.json").read_text())["commands"]:
@@ -896,7 +896,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "augmentations": augmentations_table,
     "augmentation_speed": augmentation_speed_table,
     "augmentation_aims": augmentation_aims_table,
-    "commands": commands_table,
+    "waits": waits_table,
     "segmentation": segmentation_table,
     "formats": formats_table,
     "glasses": glasses_table,

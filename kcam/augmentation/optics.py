@@ -42,11 +42,14 @@ class RandomBlur(CameraAugmentation):
     """Base of the augmentations that convolve each sample with PSFs of its own: a round thin lens, drawn per sample.
 
     The PSFs come from `optics.batch_psf` (paraxial, integrated over the pixels): the same as `optics.Imaging` of such a
-    lens with propagator="fresnel", the same psf_shape, and renormalise=True.
+    lens with propagator="fresnel", the psf_shape of the sample, and renormalise=True.
 
     Args:      pixel_pitch: [m]. outside: share of the light that the window of a PSF may leave out, which is then
                    spread over the window; smaller is slower. wavelengths: of the channels [m]; None: see `base`.
     """
+
+    together = True
+    """Whether the PSFs of a batch share tables, and are found at once."""
 
     def __init__(
         self,
@@ -66,9 +69,11 @@ class RandomBlur(CameraAugmentation):
         self.flags = {"pixel_pitch": self.pixel_pitch, "outside": outside}
         self.wavelengths = None if wavelengths is None else wavelength_grid(wavelengths)
 
-    def psf_shape(self, picture: tuple[int, int], wavelengths: Tensor) -> tuple[int, int]:
-        """Window of the PSFs [pixels], for the worst that the ranges hold, so that it does not depend on the batch."""
-        return self.window(picture, self.widest(wavelengths))
+    def psf_shape(
+        self, picture: tuple[int, int], wavelengths: Tensor, drawn: dict[str, Tensor] | None = None
+    ) -> tuple[int, int]:
+        """Window [pixels] of the PSFs of a sample with these numbers, (1,) each; without, of the worst there is."""
+        return self.window(picture, self.widest(wavelengths) if drawn is None else self.half_width(drawn, wavelengths))
 
     def window(self, picture: tuple[int, int], half_width: float) -> tuple[int, int]:
         """Pixels for PSFs of this half width [m]: odd, no more than the picture."""
@@ -84,6 +89,10 @@ class RandomBlur(CameraAugmentation):
         """Half width of the largest PSF in the ranges [m]."""
         raise NotImplementedError(f"{type(self).__name__} does not say how large its PSFs are.")
 
+    def half_width(self, drawn: dict[str, Tensor], wavelengths: Tensor) -> float:
+        """Half width of the PSF of a sample with these numbers, (1,) each [m]."""
+        return self.widest(wavelengths)
+
     def psfs(self, drawn: dict[str, Tensor], *, wavelengths: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """(B, Z, L, h, w), each of sum 1."""
         raise NotImplementedError(f"{type(self).__name__} does not say what its PSFs are.")
@@ -93,16 +102,27 @@ class RandomBlur(CameraAugmentation):
         psfs = batch_psf(vergences, pixel_pitch=self.pixel_pitch, shape=shape, dtype=like.dtype, **lens).to(like.device)
         return psfs / psfs.sum((-2, -1), keepdim=True)
 
-    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
-        """One depth: each channel of each sample with its PSF."""
-        return convolve(signal, self.kernels(signal, drawn)[:, 0])
-
     @uncompiled  # its sizes follow from numbers, at each of which a graph would break
-    def kernels(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
-        """The PSFs for a signal, (B, Z, L, h, w)."""
-        wavelengths = wavelengths_of(signal, self.wavelengths)
-        shape = self.psf_shape((signal.shape[-2], signal.shape[-1]), wavelengths)
-        return self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """One depth: each channel of each sample with its PSF, in a window of its own."""
+        rows = zip(signal.split(1), self.kernels(signal, drawn), strict=True)
+        return torch.cat([convolve(row, psfs[None]) for row, psfs in rows])
+
+    def kernels(self, signal: Tensor, drawn: dict[str, Tensor]) -> list[Tensor]:
+        """The PSFs of each sample, (L, h, w) each."""
+        wavelengths, picture = wavelengths_of(signal, self.wavelengths), (signal.shape[-2], signal.shape[-1])
+        rows = [{name: value[i : i + 1] for name, value in drawn.items()} for i in range(len(signal))]
+        shapes = [self.psf_shape(picture, wavelengths, own) for own in rows]
+        if not self.together:
+            found = zip(rows, shapes, strict=True)
+            return [self.psfs(own, wavelengths=wavelengths, shape=shape, like=signal)[0, 0] for own, shape in found]
+        largest = max(height for height, _ in shapes), max(width for _, width in shapes)
+        bank = self.psfs(drawn, wavelengths=wavelengths, shape=largest, like=signal)[:, 0]
+        kernels = []
+        for psfs, shape in zip(bank, shapes, strict=True):
+            inside = psfs[:, *(slice((n - own) // 2, (n + own) // 2) for n, own in zip(largest, shape, strict=True))]
+            kernels.append(inside / inside.sum((-2, -1), keepdim=True))
+        return kernels
 
 
 def convolve(signal: Tensor, psfs: Tensor) -> Tensor:
@@ -177,15 +197,8 @@ class RandomDefocus(RandomBlur):
         self.flags |= {"layers": layers}
 
     def widest(self, wavelengths: Tensor) -> float:
-        """At the worst of the range of distances."""
-        low, high = self.bounds("distance")
-        return self.reach(1 / high, 1 / low, wavelengths=wavelengths)
-
-    def reach(self, low: float, high: float, *, wavelengths: Tensor) -> float:
-        """Half width of the largest PSF of objects at these vergences [1/m] and between, in the ranges of the lens [m].
-
-        It is the blur of the widest aperture, or the diffraction of the narrowest.
-        """
+        """The blur of the widest aperture at the worst of the distances, or the diffraction of the narrowest."""
+        low, high = (1 / bound for bound in self.bounds("distance"))
         shortest, longest = self.bounds("focal_length")
         near, far = (1 / bound for bound in self.bounds("focus"))
         most = max(abs(end - focus) for end in (low, high) for focus in (near, far))
@@ -196,6 +209,18 @@ class RandomDefocus(RandomBlur):
             radius = shortest / (2 * number)
             widths.append(blur + self.tail(radius=radius, sensor_distance=sensor_distance, wavelengths=wavelengths))
         return max(widths)
+
+    def half_width(
+        self, drawn: dict[str, Tensor], wavelengths: Tensor, between: tuple[float, float] | None = None
+    ) -> float:
+        """Rays and diffraction of this lens, for objects at its distance, or at two vergences and between [1/m]."""
+        focal, focus, number, distance = (
+            float(drawn[name].detach()) for name in ("focal_length", "focus", "f_number", "distance")
+        )
+        radius, sensor_distance = focal / (2 * number), 1 / (1 / focal - 1 / focus)
+        most = max(abs(vergence - 1 / focus) for vergence in between or (1 / distance,))
+        tail = self.tail(radius=radius, sensor_distance=sensor_distance, wavelengths=wavelengths)
+        return radius * most * sensor_distance + tail
 
     def psfs(self, drawn: dict[str, Tensor], *, wavelengths: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """(B, 1, L, h, w), or (B, Z, L, h, w) for drawn["vergences"] (B, Z)."""
@@ -238,7 +263,7 @@ class RandomDefocus(RandomBlur):
         share = torch.linspace(0, 1, self.layers, dtype=low.dtype, device=low.device)
         vergences = low + (high - low) * (share if self.layers > 1 else share + 0.5)
         wavelengths = wavelengths_of(signal, self.wavelengths)
-        half_width = self.reach(float(low.detach()), float(high.detach()), wavelengths=wavelengths)
+        half_width = self.half_width(drawn, wavelengths, (float(low.detach()), float(high.detach())))
         shape = self.window((signal.shape[-2], signal.shape[-1]), half_width)
         drawn = drawn | {"vergences": vergences[None]}
         return vergences, self.psfs(drawn, wavelengths=wavelengths, shape=shape, like=signal)[0]
@@ -273,18 +298,24 @@ class FocusedBlur(RandomBlur):
         """Residual vergence (B,) or (B, 1, L) [1/m]."""
         return torch.zeros_like(drawn["f_number"].double())
 
-    def slope(self, wavelengths: Tensor, *, radius: float) -> float:
-        """Largest slope of the wavefront over the pupil in the ranges: the angle of a ray [rad]."""
+    def slope(self, wavelengths: Tensor, *, radius: float, drawn: dict[str, Tensor] | None = None) -> float:
+        """Largest slope of the wavefront over the pupil, the angle of a ray [rad]: of a sample with these numbers, (1,)
+        each; without, in the ranges.
+        """
         return 0.0
 
     def widest(self, wavelengths: Tensor) -> float:
         """Diffraction and rays, at the ends of the range of f-numbers."""
-        widths = []
-        for number in self.bounds("f_number"):
-            radius = self.focal_length / (2 * number)
-            tail = self.tail(radius=radius, sensor_distance=self.focal_length, wavelengths=wavelengths)
-            widths.append(tail + self.slope(wavelengths, radius=radius) * self.focal_length)
-        return max(widths)
+        return max(self._width(number, wavelengths) for number in self.bounds("f_number"))
+
+    def half_width(self, drawn: dict[str, Tensor], wavelengths: Tensor) -> float:
+        """Diffraction and rays of this lens."""
+        return self._width(float(drawn["f_number"].detach()), wavelengths, drawn)
+
+    def _width(self, number: float, wavelengths: Tensor, drawn: dict[str, Tensor] | None = None) -> float:
+        radius = self.focal_length / (2 * number)
+        tail = self.tail(radius=radius, sensor_distance=self.focal_length, wavelengths=wavelengths)
+        return tail + self.slope(wavelengths, radius=radius, drawn=drawn) * self.focal_length
 
     def psfs(self, drawn: dict[str, Tensor], *, wavelengths: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """(B, 1, L, h, w)."""
@@ -336,6 +367,7 @@ class RandomAberration(FocusedBlur):
     """
 
     TERMS = 12  # Z4 .. Z15: all but piston and tilts, up to the fourth order
+    together = False
 
     def __init__(
         self,
@@ -357,12 +389,13 @@ class RandomAberration(FocusedBlur):
         direction = F.normalize(drawn["direction"].double(), dim=1)
         return F.pad(direction * drawn["rms"].double()[:, None].to(direction) * DESIGN, (3, 0))
 
-    def slope(self, wavelengths: Tensor, *, radius: float) -> float:
+    def slope(self, wavelengths: Tensor, *, radius: float, drawn: dict[str, Tensor] | None = None) -> float:
         """The steepest sum of Z4 to Z15 rises by 20 RMS / a at 0.8 a, the mean one by 15 at the rim.
 
         At 2 waves nine draws of ten then send less than 1.1 % of their light farther; the worst of 60 sent 2.4 %.
         """
-        return self.bounds("rms")[1] * DESIGN * 20 / radius
+        rms = self.bounds("rms")[1] if drawn is None else float(drawn["rms"].detach())
+        return rms * DESIGN * 20 / radius
 
 
 class RandomChromaticAberration(FocusedBlur):
@@ -418,11 +451,11 @@ class RandomChromaticAberration(FocusedBlur):
         axial = drawn["axial"].double()
         return -axial[:, None, None] * power.to(axial.device) / self.focal_length
 
-    def slope(self, wavelengths: Tensor, *, radius: float) -> float:
+    def slope(self, wavelengths: Tensor, *, radius: float, drawn: dict[str, Tensor] | None = None) -> float:
         """Of the focal shift at the ends of the spectrum."""
         power, _ = self.dispersion(wavelengths)
-        most = max(abs(bound) for bound in self.bounds("axial")) * float(power.abs().max())
-        return radius * most / self.focal_length
+        shifts = self.bounds("axial") if drawn is None else drawn["axial"].tolist()
+        return radius * max(map(abs, shifts)) * float(power.abs().max()) / self.focal_length
 
     def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         """Each channel at its size, then blurred."""

@@ -42,6 +42,11 @@ def row(drawn: dict[str, Tensor], index: int) -> dict[str, float]:
     return {name: float(value[index]) for name, value in drawn.items() if value.ndim == 1}
 
 
+def alone(drawn: dict[str, Tensor], index: int) -> dict[str, Tensor]:
+    """The numbers of one row, (1, ...) each."""
+    return {name: value[index : index + 1] for name, value in drawn.items()}
+
+
 def in_light(signal: Tensor) -> Tensor:
     """What `simulate` is given: a picture in linear light, a cube as it is."""
     return to_light(signal) if is_picture(signal) else signal
@@ -59,10 +64,12 @@ def imaged(
     augmentation: KC.CameraAugmentation,
     wavelengths: Tensor,
     depth: float | Tensor = math.inf,
+    drawn: dict[str, Tensor] | None = None,
     **options,
 ) -> Tensor:
-    """Linear light (1,C,H,W) through a lens, with the window and the pixels of an augmentation."""
-    window = {"psf_shape": augmentation.psf_shape((light.shape[-2], light.shape[-1]), wavelengths)} | options
+    """Linear light (1,C,H,W) through a lens, with the pixels of an augmentation, and its window for these numbers."""
+    shape = light.shape[-2], light.shape[-1]
+    window = {"psf_shape": augmentation.psf_shape(shape, wavelengths, drawn)} | options
     stage = optics.Imaging(lens, pixel_pitch=augmentation.pixel_pitch, propagator="fresnel", renormalise=True, **window)
     return stage(Scene.from_bands(light, wavelengths=wavelengths, depth=depth))
 

@@ -12,6 +12,7 @@ from drawing import (
     BANDS,
     PRIMARIES,
     agree_row_by_row,
+    alone,
     augmented,
     imaged,
     in_light,
@@ -51,10 +52,14 @@ class TestDefocus:
             depth, options = values["distance"], {}
             if depths is not None:
                 depth = depths[index : index + 1]
-                half = augmentation.reach(1 / float(depth.max()), 1 / float(depth.min()), wavelengths=grid)
+                between = 1 / float(depth.max()), 1 / float(depth.min())
+                half = augmentation.half_width(alone(drawn, index), grid, between)
                 window = augmentation.window((light.shape[-2], light.shape[-1]), half)
                 options = {"layers": augmentation.layers, "psf_shape": window}
-            return imaged(lens, light, augmentation=augmentation, wavelengths=grid, depth=depth, **options)
+            own = alone(drawn, index)
+            return imaged(
+                lens, light, augmentation=augmentation, wavelengths=grid, depth=depth, drawn=own, **options
+            )
 
         return render
 
@@ -204,7 +209,8 @@ def test_diffraction_is_imaging_with_a_stopped_down_lens(channels: int) -> None:
 
     def by_hand(light: Tensor, index: int, drawn: dict[str, Tensor]) -> Tensor:
         lens = round_lens(augmentation.focal_length, row(drawn, index)["f_number"])
-        return imaged(lens, light, augmentation=augmentation, wavelengths=wavelengths_for(channels))
+        grid = wavelengths_for(channels)
+        return imaged(lens, light, augmentation=augmentation, wavelengths=grid, drawn=alone(drawn, index))
 
     agree_row_by_row(augmentation, picture(3, channels, 31, 40), by_hand, bound=SAMPLINGS)
 
@@ -219,7 +225,8 @@ class TestAberration:
             noll = torch.zeros(15, dtype=torch.float64)
             noll[3:] = direction / direction.norm() * drawn["rms"][index] * 550 * nm
             lens = round_lens(augmentation.focal_length, row(drawn, index)["f_number"], optics.ZernikeAberration(noll))
-            return imaged(lens, light, augmentation=augmentation, wavelengths=wavelengths_for(channels))
+            grid = wavelengths_for(channels)
+            return imaged(lens, light, augmentation=augmentation, wavelengths=grid, drawn=alone(drawn, index))
 
         agree_row_by_row(augmentation, picture(2, channels, 30, 33), by_hand, bound=SAMPLINGS)
 
@@ -281,7 +288,7 @@ class TestChromaticAberration:
             for channel in range(channels):
                 residual = optics.Defocus(-values["axial"] * (float(power[channel]) - 1) / f)
                 lens = round_lens(f, values["f_number"], residual)
-                shape = augmentation.psf_shape((light.shape[-2], light.shape[-1]), grid)
+                shape = augmentation.psf_shape((light.shape[-2], light.shape[-1]), grid, alone(drawn, index))
                 one = optics.Imaging(
                     lens,
                     pixel_pitch=augmentation.pixel_pitch,

@@ -107,13 +107,8 @@ def batch_psf(
     own = coefficients.to(device, torch.float64)[:, None, None].expand(-1, opd.shape[1], layers, -1)
     opd = torch.cat([opd, own], dim=-1)
     with torch.no_grad():
-        side = torch.linspace(-1, 1, 65, dtype=torch.float64)
-        coarse = _zernike_maps(side, terms).to(device)
-        inside = (side[None, :] ** 2 + side[:, None] ** 2 <= 1.0001).flatten().to(device)
-        slopes = [
-            (opd @ g.flatten(1)[:, inside]).square() for g in torch.gradient(coarse, spacing=2 / 64, dim=(-2, -1))
-        ]
-        displacement = torch.stack(slopes).sum(0).sqrt().amax(dim=(1, 2, 3)) * d / a
+        down, across = ((opd @ slope.to(device)).square() for slope in _zernike_slopes(terms))
+        displacement = (down + across).sqrt().amax(dim=(1, 2, 3)) * d / a
     # lens by lens: a slow lens needs a smaller pupil and fewer points than the fastest of the batch
     images = [
         _aberrated(
@@ -167,6 +162,7 @@ def _aberrated(
         wavelength=shortest,
     )
     reach, step = math.ceil(per_pixel * margin), pixel_pitch / per_pixel
+    count = _rounded(count)
     nodes = grid_nodes(count)
     like = torch.empty(0, dtype=dtype, device=device)
     wavenumbers = (2 * math.pi / grid).to(device)
@@ -199,7 +195,17 @@ def _zernike_maps(nodes: Tensor, terms: int) -> Tensor:
     return torch.stack([m.expand(len(nodes), len(nodes)) for m in maps])
 
 
-@functools.lru_cache(maxsize=8)  # 13 MB for 15 terms on 448 nodes
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _zernike_slopes(terms: int) -> tuple[Tensor, Tensor]:
+    """Of the maps along y and x, on a coarse grid in the pupil, (1 + terms, n) each."""
+    side = torch.linspace(-1, 1, 65, dtype=torch.float64)
+    inside = (side[None, :] ** 2 + side[:, None] ** 2 <= 1.0001).flatten()
+    down, across = torch.gradient(_zernike_maps(side, terms), spacing=2 / 64, dim=(-2, -1))
+    return down.flatten(1)[:, inside], across.flatten(1)[:, inside]
+
+
+@functools.lru_cache(maxsize=16)  # 13 MB for 15 terms on 448 nodes
 @torch.inference_mode(False)
 def _pupil_maps(count: int, terms: int, dtype: torch.dtype) -> Tensor:
     return _zernike_maps(grid_nodes(count), terms).to(dtype)
