@@ -369,6 +369,7 @@ import sys
 from kcam.data import parse_bands
 from kcam.data.convert import Conversion, convert
 from resident import peak
+import scipy.interpolate  # which is imported when it is used
 base = peak()
 report = convert([sys.argv[1]], sys.argv[2], Conversion(bands=parse_bands("420:720:28")))
 assert not report.failed, report.failed
