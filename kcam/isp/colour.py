@@ -307,9 +307,9 @@ def render_tones(signal: Tensor, *, gamma: Tensor, contrast: Tensor) -> Tensor:
     low = offset**gamma
     high = (1 + offset) ** gamma
     if signal.dtype == torch.float32 and all(map(is_plain, (signal, gamma, contrast))):  # the same, in place
-        tone = signal.clamp(0, 1).add_(offset).log2_().mul_(gamma).exp2_().sub_(low).div_(high - low)
-        bend = tone.mul(-2).add_(3).mul_(tone).sub_(1).mul_(2 * contrast).add_(1)
-        return tone.mul_(bend)
+        tone = (signal.clamp(0, 1).add_(offset).log2_() * gamma).exp2_().sub_(low).div_(high - low)
+        bend = (tone.mul(-2).add_(3).mul_(tone).sub_(1) * (2 * contrast)).add_(1)
+        return bend.mul_(tone)
     tone = ((signal.clamp(0, 1) + offset) ** gamma - low) / (high - low)
     return tone + 2 * contrast * tone * (1 - tone) * (2 * tone - 1)
 

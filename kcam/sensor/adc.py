@@ -46,7 +46,8 @@ def quantise(
     level = clip_ste(amplified if _is(black_level, 0.0) else amplified + like(black_level, signal) / top, 0.0, 1.0)
     if not rounding:
         return level
-    return level.mul_(top).round_().div_(top) if is_plain(level) else round_ste(level * top) / top
+    counts = level * top
+    return counts.round_().div_(top) if is_plain(counts) else round_ste(counts) / top
 
 
 def _is(value: Tensor | float, neutral: float) -> bool:

@@ -40,9 +40,10 @@ def can_count(means: Tensor) -> bool:
 def counts(means: Tensor, generator: torch.Generator | None) -> Tensor:
     """Poisson counts, of the shape of the means, where these are >= 0, float32 and on the CPU: see `can_count`."""
     flat = means.reshape(-1)
-    result, bytes_ = torch.empty_like(flat), torch.empty(-(-len(flat) // _PIECE) * _PIECE, dtype=torch.uint8)
+    result = torch.empty_like(flat)
+    bytes_ = flat.new_empty(-(-len(flat) // _PIECE) * _PIECE, dtype=torch.uint8)
     bytes_.view(torch.int64).random_(-(2**63), None, generator=generator)
-    room = torch.empty(2, min(_PIECE, len(flat)))
+    room = flat.new_empty(2, min(_PIECE, len(flat)))
     doubtful = []
     for index, (mean, count) in enumerate(zip(flat.split(_PIECE), result.split(_PIECE), strict=True)):
         if float(mean.max()) < LEAST:
@@ -72,7 +73,8 @@ def _inverted(means: Tensor, generator: torch.Generator | None) -> Tensor:
     found = torch.zeros_like(means)
     for mean, count in zip(means.split(_PIECE), found.split(_PIECE), strict=True):
         term = torch.exp(-mean)
-        missing, above = torch.rand(len(mean), generator=generator).sub_(term), torch.empty_like(mean)  # u - F(k)
+        missing = torch.empty_like(mean).uniform_(generator=generator).sub_(term)  # u - F(k)
+        above = torch.empty_like(mean)
         for k in range(1, _STEPS):
             count.add_(torch.gt(missing, 0, out=above))
             missing.sub_(term.mul_(mean).mul_(1 / k))
@@ -84,7 +86,7 @@ def _inverted(means: Tensor, generator: torch.Generator | None) -> Tensor:
 def _settled(mean: Tensor, count: Tensor, byte: Tensor, generator: torch.Generator | None) -> Tensor:
     """The counts that a byte did not settle, (N,) each."""
     mu, k = mean.double(), count.double()
-    u = (byte + torch.rand(len(mean), dtype=torch.float64, generator=generator)) / 256
+    u = (byte + torch.empty_like(mu).uniform_(generator=generator)) / 256
     open_ = ((mu - k) ** 3 > 6 * mu.square() * u).nonzero().flatten()
     mu, k, u = mu[open_], k[open_], u[open_]
     poisson, normal = _laws(mu, k)
@@ -94,10 +96,10 @@ def _settled(mean: Tensor, count: Tensor, byte: Tensor, generator: torch.Generat
 
 def _remaining(mu: Tensor, generator: torch.Generator | None) -> Tensor:
     """Draws from (p - q)+, (N,) float64."""
-    found, waiting = torch.empty_like(mu), torch.arange(len(mu))
+    found, waiting = torch.empty_like(mu), torch.arange(len(mu), device=mu.device)
     while len(waiting):
         mean = mu[waiting]
-        side, height, far = torch.rand(3, len(mean), dtype=torch.float64, generator=generator)
+        side, height, far = mean.new_empty(3, len(mean)).uniform_(generator=generator)
         away = -torch.log1p(-far)
         t = _SHIFT + torch.where(side < 0.5, -away, away)
         k = torch.floor(mean + mean.sqrt() * t)

@@ -312,3 +312,13 @@ class TestErrors:
             isp.WhiteBalance()(torch.zeros(2, 2))
         with pytest.raises(ValueError, match="the sRGB curve takes 3 channels, or 1 of gray, got 4"):
             isp.ToneCurve()(torch.zeros(1, 4, 2, 2))
+
+
+def test_tones_broadcast_with_and_without_a_gradient() -> None:
+    """One plane rendered in three ways, and a batch of planes each in its own."""
+    plane = torch.rand(1, 5, 6, generator=torch.Generator().manual_seed(0))
+    gamma, contrast = torch.tensor([0.5, 1.0, 2.0])[:, None, None], torch.tensor(0.2)
+    found = isp.render_tones(plane, gamma=gamma, contrast=contrast)
+    assert found.shape == (3, 5, 6)
+    traced = isp.render_tones(plane.clone().requires_grad_(), gamma=gamma, contrast=contrast)
+    torch.testing.assert_close(found, traced.detach(), atol=1e-6, rtol=0)

@@ -82,3 +82,9 @@ def test_errors(arguments, error, text):
 def test_an_integer_signal_is_refused():
     with pytest.raises(TypeError, match=r"in which 1.0 is the full well .* of torch.uint8. Use signal.float"):
         ADC()(torch.zeros(1, 1, 2, 2, dtype=torch.uint8))
+
+
+def test_bits_broadcast_against_the_signal() -> None:
+    signal = torch.rand(5, 6, generator=torch.Generator().manual_seed(0))
+    found = quantise(signal, bits=torch.tensor([2, 8])[:, None, None])
+    assert torch.equal(found, torch.stack([quantise(signal, bits=2), quantise(signal, bits=8)]))

@@ -106,3 +106,17 @@ def test_what_cannot_be_counted_so() -> None:
         assert not counting.can_count(means)
     assert counting.can_count(torch.tensor([0.0, 8e6]))
     assert poisson(torch.tensor([3e7]), generator=seeded(0)).isfinite().all()
+
+
+def test_torch_s_defaults_do_not_matter() -> None:
+    means = 20 * torch.rand(1000, generator=seeded(0))
+    expected = counting.counts(means, seeded(1))
+    before = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        with torch.device("meta"):
+            found = counting.counts(means, seeded(1))
+    finally:
+        torch.set_default_dtype(before)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, expected)
