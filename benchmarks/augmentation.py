@@ -15,7 +15,12 @@ from __future__ import annotations
 
 import argparse
 import functools
+import json
+import os
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -426,6 +431,15 @@ def pipeline(*, batch: int, side: int, batches: int, rounds: int) -> dict[str, A
     return {"size": f"{batch} x 3 x {side}^2", "stages": names, "p": 0.5, "workers": 2, "seconds_per_batch": seconds}
 
 
+def aims_without_avx512() -> list[dict[str, Any]]:
+    """The aims in a process whose torch takes no AVX-512, as on other processors."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "aims.json"
+        command = [sys.executable, "-m", "benchmarks.augmentation", "--aims", "--out", str(out)]
+        subprocess.run(command, check=True, env=os.environ | {"ATEN_CPU_CAPABILITY": "avx2"}, capture_output=True)
+        return json.loads(out.read_text())["aims"]
+
+
 def half_of_the_rows(batch: int) -> int:
     """A seed of the global generator for which half of the rows are drawn at p = 0.5: Kornia's gate comes first."""
     for seed in range(1000):
@@ -548,6 +562,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="tiny pictures, for the tests")
     parser.add_argument("--only", help="augmentations whose name contains this; nothing is written")
+    parser.add_argument("--aims", action="store_true", help="what the aims are about alone")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     sizes: dict[str, Any] = {"batch": BATCH, "side": SIDE, "seconds": 4.0}
@@ -559,16 +574,21 @@ def main(arguments: list[str] | None = None) -> int:
             for name, case in CASES.items():
                 if channels not in case.only or (options.only and options.only not in name):
                     continue
+                if options.aims and (channels != 3 or name not in {aim.name for aim in AIMS}):
+                    continue
                 line = compare(name, case, channels=channels, **sizes)
                 lines.append(line)
                 times = ", ".join(f"{who} {1e3 * t:.1f}" for who, t in line["seconds"].items())
                 shares = ", ".join(f"p={p}: {found['share_of_maths']:.2f}" for p, found in line["added"].items())
                 console.print(f"[bold]{line['augmentation']}[/] {line['size']}: ms: {times}; we add {shares}")
-    if not options.only:
+    if options.aims:
+        write_json(options.out, {"environment": environment(), "aims": [aim.verdict(lines) for aim in AIMS]})
+    elif not options.only:
         few = {"batch": sizes["batch"], "side": sizes["side"]}
         with threads.fixed(1), torch.random.fork_rng():
             found = {
                 "aims": [aim.verdict(lines) for aim in AIMS],
+                "aims_avx2": [] if options.quick else aims_without_avx512(),
                 "run": run(**few, seconds=4 * sizes["seconds"]),
                 "pipeline": pipeline(
                     batch=2 * sizes["batch"], side=sizes["side"], batches=2 if options.quick else 8,
