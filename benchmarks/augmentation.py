@@ -487,7 +487,7 @@ def compare(name: str, case: Case, *, channels: int, batch: int, side: int, seco
                 contestants += [Contestant(who, seeded(make(p)), no_error) for who, make in case.relatives.items()]
             if coded:
                 contestants.append(Contestant("light", lambda: tone_curve(to_light(picture)), no_error))
-                contestants.append(Contestant("two powers", lambda: (picture**2.4, picture ** (1 / 2.4)), no_error))
+                contestants.append(Contestant(POWERS, lambda: (picture**2.4, picture ** (1 / 2.4)), no_error))
         contestants += [
             Contestant(f"kcam {p:g}", seeded(own), no_error, default=p == 1),
             Contestant(f"kcam simulate {p:g}", lambda a=own, s=light, d=drawn: simulate(a, s, d), no_error),

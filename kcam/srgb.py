@@ -24,7 +24,6 @@ _PIECE = 2**17
 """Numbers per thread: half a megabyte, and as much again for what is added."""
 _CODED, _LIGHT = 0.0404482362771082, 0.00313066844250063
 """Where line and power really meet. The standard rounds them, and is 3e-8 from continuous there."""
-_SCALE_OF_LIGHT, _SCALE_OF_CODE = torch.tensor(-2.4 * math.log2(1.055)), torch.tensor(math.log2(1.055))
 
 
 def to_light(coded: Tensor) -> Tensor:
@@ -69,13 +68,11 @@ def _code_of(light: Tensor, out: Tensor, spare: Tensor) -> None:
 
 
 def _power_of_code(coded: Tensor) -> Tensor:
-    logarithm = coded.add_(0.055).log2_()
-    return torch.add(_SCALE_OF_LIGHT, logarithm, alpha=2.4, out=logarithm).exp2_()
+    return coded.add_(0.055).log2_().mul_(2.4).sub_(2.4 * math.log2(1.055)).exp2_()
 
 
 def _power_of_light(light: Tensor) -> Tensor:
-    logarithm = light.log2_()
-    return torch.add(_SCALE_OF_CODE, logarithm, alpha=1 / 2.4, out=logarithm).exp2_()
+    return light.log2_().mul_(1 / 2.4).add_(math.log2(1.055)).exp2_()
 
 
 @functools.cache

@@ -29,7 +29,9 @@ RGB_WAVELENGTHS = (611.4 * nm, 549.1 * nm, 464.2 * nm)
 
 
 _LARGE = 2**20
-"""Numbers of a row: a cube's."""
+"""Numbers of a row, a cube's, from which on a CPU rows are given one by one: see `on_drawn_rows`."""
+TOLD = frozenset({"linear", "run", "cube"})
+"""What a `CameraSequential` says of where an augmentation stands: nothing that was drawn."""
 TAKES = "(B,C,H,W), a picture in [0,1] or a cube"
 _LEAST, _LARGEST = -0.5, 2.5
 """Of a picture: some beyond 0 and 1 come from other augmentations; from here on it is another scale."""
@@ -163,6 +165,7 @@ class Checked:
         output = own.apply_transform(batch, params, flags, transform=transform)
         if batch.is_contiguous(memory_format=torch.channels_last) and not batch.is_contiguous():
             output = output.contiguous(memory_format=torch.channels_last)
+        own._commit_state(params={name: value for name, value in params.items() if name not in TOLD})  # for a replay
         return own.transform_output_tensor(output, input.shape)
 
 
@@ -275,7 +278,6 @@ class CameraAugmentation(Checked, K.IntensityAugmentationBase2D):
             shape = (input.shape[0], self.output_channels(input.shape[1]), *input.shape[2:])
             return input.new_zeros(shape) + input.sum()
 
-
         def effect(rows: Tensor, own: dict[str, Tensor]) -> Tensor:
             return simulated(rows, lambda light: self.simulate(light, own), told=params, in_light=self.in_light)
 
@@ -313,5 +315,5 @@ def simulated(
         coded = in_light and picture
         result = effect(to_light(working) if coded else working)
         if "run" in told:
-            result = result.clamp_(0, 1) if result is not working and is_plain(result) else clip_ste(result, 0.0, 1.0)
+            result = clip_ste(result, 0.0, 1.0)  # not in place: what `simulate` gives may be kept by its class
         return (to_code(result) if coded else result).to(input.dtype)

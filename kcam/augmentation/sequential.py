@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import kornia.augmentation as K
@@ -128,7 +129,9 @@ class CameraSequential(K.AugmentationSequential):
             after[-3] = self._after(module, batch_shape[-3], context)
             batch_shape = torch.Size(after)
             params.append(param)
-        self.transform_op.begin(params)
+        light = None if torch.compiler.is_compiling() else _LIGHT.get()
+        if light is not None and light.owner is self:
+            light.begin(params)
         return params
 
     def transform_inputs(
@@ -137,7 +140,9 @@ class CameraSequential(K.AugmentationSequential):
         """What another container calls: pictures alone."""
         self.clear_state()
         self._enters(input)
-        light = _Light(self.takes_light(params))
+        light = _Light(self)
+        if not torch.compiler.is_compiling():
+            light.begin(params)
         for param in params:
             module = self.get_submodule(param.name)
             if self.runs(module):
@@ -146,7 +151,7 @@ class CameraSequential(K.AugmentationSequential):
                 input, told = light.enter(module, param, input)
                 told = {**(extra_args or {}), **self.told(param.name), **told}
                 input = InputSequentialOps.transform(input, module=module, param=param, extra_args=told)
-                input = light.leave(input)
+                input = light.leave(param, input)
             self._update_transform_matrix_by_module(module)
         self._params = params
         return input
@@ -210,8 +215,16 @@ class CameraSequential(K.AugmentationSequential):
     def forward(self, *args: Any, params: list[ParamItem] | None = None, data_keys: Any = None) -> Any:
         """As `K.AugmentationSequential`."""
         self.transform_op.names = []
-        self.transform_op.begin(params)
-        return super().forward(*args, params=params, data_keys=data_keys)
+        if torch.compiler.is_compiling():
+            return super().forward(*args, params=params, data_keys=data_keys)
+        light = _Light(self)
+        if params is not None:  # given again; else they are drawn in `forward_parameters`
+            light.begin(params)
+        token = _LIGHT.set(light)
+        try:
+            return super().forward(*args, params=params, data_keys=data_keys)
+        finally:
+            _LIGHT.reset(token)
 
     def _arguments_preproc(self, *args: Any, data_keys: Any, params: Any = None) -> Any:
         seeing = self.depth and any(
@@ -250,11 +263,6 @@ class _Ops(AugmentationSequentialOps):
         super().__init__(data_keys)
         self.owner = [owner]  # in a list: a module in an attribute would be its child
         self.names: list[str] = []
-        self.light = _Light([])
-
-    def begin(self, params: list[ParamItem] | None) -> None:
-        """Look ahead at what is to be run, which is drawn in `forward_parameters` or given again."""
-        self.light = _Light(self.owner[0].takes_light(params or []))
 
     def transform(self, *arg: Any, module: nn.Module, param: ParamItem, extra_args: Any, data_keys: Any = None) -> Any:
         owner = self.owner[0]
@@ -271,16 +279,17 @@ class _Ops(AugmentationSequentialOps):
             depth = self._depth(arg, keys)
             own |= {} if depth is None else {"inverse_depth": depth}
         inputs: list[Any] = list(arg)
+        light = None if torch.compiler.is_compiling() else _LIGHT.get()
         picture = keys.index(DataKey.INPUT) if keys.count(DataKey.INPUT) == 1 else None
-        if picture is not None:
-            inputs[picture], told = self.light.enter(module, param, inputs[picture])
+        if light is not None and light.owner is owner and picture is not None:
+            inputs[picture], told = light.enter(module, param, inputs[picture])
             own |= told
         if own:
             extra_args = {**extra_args, DataKey.INPUT: {**extra_args.get(DataKey.INPUT, {}), **own}}
         found: Any = super().transform(*inputs, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
         results = [found] if len(arg) == 1 else list(found)
-        if picture is not None:
-            results[picture] = self.light.leave(results[picture])
+        if light is not None and light.owner is owner and picture is not None:
+            results[picture] = light.leave(param, results[picture])
         return results[0] if len(arg) == 1 else results
 
     def _place(self, keys: Sequence[DataKey]) -> int | None:
@@ -320,23 +329,32 @@ class _Ops(AugmentationSequentialOps):
 class _Light:
     """The way of a picture through neighbours that all take linear light: taken there once, and coded once behind them.
 
-    Rows that none of them drew come out as they went in.
+    Rows that none of them drew come out as they went in. It belongs to one call.
 
-    Args:      takes: whether each module of a call does.
+    Args:      owner: whose call it is.
     """
 
-    def __init__(self, takes: Sequence[bool]) -> None:
-        self._takes = [not torch.compiler.is_compiling() and each for each in takes] + [False]
-        self._place = -1
+    def __init__(self, owner: CameraSequential) -> None:
+        self.owner = owner
+        self._params: list[ParamItem] = []
+        self._takes = [False]
         self._coded: Tensor | None = None
 
+    def begin(self, params: list[ParamItem]) -> None:
+        """Look ahead at what is to be run: which of it takes light."""
+        self._params, self._takes = params, [*self.owner.takes_light(params), False]
+
+    def _place(self, param: ParamItem) -> int:
+        return next((place for place, own in enumerate(self._params) if own is param), len(self._params))
+
     def enter(self, module: Any, param: ParamItem, input: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """What the next module gets, and is told of it."""
-        self._place = min(self._place + 1, len(self._takes) - 1)
-        if not self._takes[self._place]:
+        """What a module gets, and is told of it."""
+        place = self._place(param)
+        if not self._takes[place]:
             return input, {}
         if self._coded is None:
-            if not self._takes[self._place + 1] or input.ndim not in (3, 4) or not is_picture(input):
+            picture = input.ndim in (3, 4) and input.numel() > 0 and is_picture(input)
+            if not picture or not self._takes[place + 1]:
                 return input, {}
             check_values(input, picture=True)
             self._coded, self._keepdim = input, True
@@ -348,10 +366,10 @@ class _Light:
         self._keepdim &= bool(module.keepdim)
         return input, {"linear": torch.ones(()), "run": torch.ones(())}
 
-    def leave(self, output: Tensor) -> Tensor:
+    def leave(self, param: ParamItem, output: Tensor) -> Tensor:
         """What comes out of it."""
         coded = self._coded
-        if coded is None or self._takes[self._place + 1]:
+        if coded is None or self._takes[self._place(param) + 1]:
             return output
         self._coded = None
         picture = to_code(output).to(coded.dtype)
@@ -359,6 +377,10 @@ class _Light:
         if len(others):
             picture = picture.index_copy(0, others, coded.view_as(picture)[others])
         return picture[0] if coded.ndim == 3 and self._keepdim else picture
+
+
+_LIGHT: ContextVar[_Light | None] = ContextVar("light", default=None)
+"""Of the call that runs in this thread; none to torch.compile, where each augmentation goes its own way."""
 
 
 def _check_is_depth(mask: Any) -> None:

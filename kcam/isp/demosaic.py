@@ -450,16 +450,17 @@ def demosaic(
 
 
 def _in_strips(planes: Tensor, fill: Callable[[Tensor], Tensor], *, channels: int, halo: int) -> Tensor:
-    """fill(planes) by rows that stay in the cache, each with a halo: three times as fast at 12 megapixels."""
+    """fill(planes) by pictures, or rows with a halo, that stay in the cache: three times as fast at 12 megapixels."""
     count, _, height, width = planes.shape
-    rows = max(2, _IN_CACHE // (count * width) // 2 * 2)
-    if rows >= height:
+    at_once, rows = max(1, _IN_CACHE // (height * width)), max(2, _IN_CACHE // width // 2 * 2)
+    if at_once >= count and rows >= height:
         return fill(planes)
     result = planes.new_empty(count, channels, height, width)
-    for top in range(0, height, rows):
-        first = max(0, top - halo)
-        part = fill(planes[..., first : top + rows + halo, :])
-        result[..., top : top + rows, :] = part[..., top - first : top - first + rows, :]
+    for some, target in zip(planes.split(at_once), result.split(at_once), strict=True):
+        for top in range(0, height, rows):
+            first = max(0, top - halo)
+            part = fill(some[..., first : top + rows + halo, :])
+            target[..., top : top + rows, :] = part[..., top - first : top - first + rows, :]
     return result
 
 

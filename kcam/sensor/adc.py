@@ -41,7 +41,7 @@ def quantise(
     >>> [round(float(15 * sensor.quantise(torch.tensor(share), bits=4)), 3) for share in (0.0, 0.31, 1.7)]  # DN of 15
     [0.0, 5.0, 15.0]
     """
-    top = 2**bits - 1 if isinstance(bits, int) else like(2**bits - 1, signal)
+    top = 2**bits - 1 if isinstance(bits, int) else like(2 ** bits.long() - 1, signal)
     amplified = signal if _is(gain, 1.0) else signal * like(gain, signal)
     level = clip_ste(amplified if _is(black_level, 0.0) else amplified + like(black_level, signal) / top, 0.0, 1.0)
     if not rounding:

@@ -210,10 +210,15 @@ def test_the_polynomial_between_nodes_is_where_pixels_go(seed: int) -> None:
     augmentation = KC.RandomLensDistortion(k1=k1, k2=k2, p1=p1, p2=p2, p=1.0)
     params = augmentation.forward_parameters(torch.Size((1, 3, *shape)))
     for inverse in (False, True):
-        def move(points: Tensor, inverse: bool = inverse) -> Tensor:
+        asked: list[int] = []
+
+        def move(points: Tensor, inverse: bool = inverse, asked: list[int] = asked) -> Tensor:
+            asked.append(points.shape[-2])
             return augmentation._through(points, params, shape, inverse=inverse)
 
         found = _moved_pixels(shape, move, torch.zeros((), dtype=torch.float64))
+        if seed == 0 and not inverse:
+            assert asked == [400, 81]  # nodes and probes: no pixel
         y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in shape), indexing="ij")
         exact = move(torch.stack([x, y], dim=-1).flatten(0, 1)[None]).mT.unflatten(2, shape)
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-3)

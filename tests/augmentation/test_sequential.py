@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import random
+import threading
 from typing import Any
 
 import kornia.augmentation as K
@@ -401,7 +402,9 @@ def neighbours(seed: int, *, p: float, keepdim: bool = False) -> list[nn.Module]
     draw = random.Random(seed)
     kinds = [KC.RandomExposure, KC.RandomWhiteBalance, KC.RandomVignetting, KC.RandomDefocus, KC.RandomToneCurve,
              KC.RandomColourMatrix, KC.RandomLensDistortion]  # fmt: skip
-    return [kind(p=p, keepdim=keepdim) for kind in draw.choices(kinds, k=draw.randint(2, 5))]
+    drawn = [kind(p=p, keepdim=keepdim) for kind in draw.choices(kinds, k=draw.randint(2, 5))]
+    drawn.insert(draw.randint(0, len(drawn)), nn.Identity())  # what is no augmentation, Kornia calls by itself
+    return drawn
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -419,10 +422,15 @@ def test_light_that_is_kept_gives_the_same_picture(seed: int, p: float) -> None:
     found = ours(picture)
     assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
-    idle = torch.stack([torch.atleast_1d(param.data["batch_prob"]) < 0.5 for param in ours._params]).all(0)
+    gates = [torch.atleast_1d(param.data["batch_prob"]) < 0.5 for param in ours._params if param.data is not None]
+    idle = torch.stack(gates).all(0)
     batch = picture if picture.ndim == 4 else picture[None]
     assert torch.equal((found if found.ndim == 4 else found[None])[idle], batch[idle])
     torch.testing.assert_close(ours(picture, params=ours._params), found, rtol=0, atol=0)  # a replay
+    if picture.ndim == 4:
+        nested = K.AugmentationSequential(ours)
+        torch.manual_seed(seed)
+        torch.testing.assert_close(nested(picture), found, rtol=0, atol=2e-6)
 
 
 def test_light_is_kept_from_one_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -457,3 +465,70 @@ def test_pictures_out_of_range_are_refused_where_light_is_kept() -> None:
     with pytest.raises(ValueError, match="expected sRGB in"):
         pipeline(255 * torch.rand(1, 3, 8, 8))
     torch.testing.assert_close(pipeline(torch.zeros(1, 3, 8, 8)), torch.zeros(1, 3, 8, 8))  # and what follows is right
+
+
+class Raising(KC.CameraAugmentation):
+    """An effect of somebody's own that fails."""
+
+    def __init__(self) -> None:
+        super().__init__({}, p=1.0)
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        raise RuntimeError("no light today")
+
+
+class Gray(Raising):
+    """One whose result has less memory than it has pixels."""
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        return signal.mean(1, keepdim=True).expand_as(signal)
+
+
+def test_a_stage_or_a_module_before_neighbours_changes_nothing_about_them() -> None:
+    exposure, vignetting = KC.RandomExposure(stops=0.5, p=1.0), KC.RandomVignetting(p=1.0, field=60.0, shade=0.2)
+    other = KC.RandomVignetting(p=1.0, field=50.0, shade=0.1)
+    x = torch.rand(2, 3, 12, 12)
+    for modules in ([nn.Identity(), exposure, vignetting], [sensor.ADC(8), exposure, vignetting],
+                    [exposure, nn.Identity(), vignetting, other]):  # fmt: skip
+        expected = x
+        for module in modules:
+            expected = module(expected)
+        torch.testing.assert_close(KC.CameraSequential(*modules)(x), expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("shape", [(0, 3, 8, 8), (2, 3, 0, 8)])
+def test_nothing_in_neighbours_gives_nothing(shape: tuple[int, ...]) -> None:
+    assert KC.CameraSequential(KC.RandomExposure(p=1.0), KC.RandomVignetting(p=1.0))(torch.rand(shape)).shape == shape
+
+
+def test_light_belongs_to_a_call() -> None:
+    """Threads get their own pictures, and after an error nothing is left that a copy would take along."""
+    stages = KC.RandomExposure(stops=0.5, p=1.0), KC.RandomVignetting(p=1.0, field=60.0, shade=0.2)
+    pipeline, found = KC.CameraSequential(*stages), {}
+    pictures = [torch.rand(2, 3, 48, 48, generator=torch.Generator().manual_seed(seed)) for seed in range(8)]
+    threads = [
+        threading.Thread(target=lambda i=i, x=x: found.update({i: pipeline(x)})) for i, x in enumerate(pictures)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for index, x in enumerate(pictures):
+        torch.testing.assert_close(found[index], stages[1](stages[0](x)), rtol=0, atol=2e-6)
+    failing = KC.CameraSequential(stages[0], Raising())
+    with pytest.raises(RuntimeError, match="no light today"):
+        failing(torch.rand(1, 3, 8, 8, requires_grad=True))
+    copy.deepcopy(failing)
+    assert len(pickle.dumps(failing)) < 100_000
+
+
+def test_a_result_of_ones_own_is_not_written_to() -> None:
+    assert KC.CameraSequential(Gray(), KC.RandomExposure(p=1.0))(torch.rand(1, 3, 8, 8)).isfinite().all()
+
+
+def test_a_child_of_neighbours_is_replayed_alone() -> None:
+    exposure = KC.RandomExposure(p=1.0)
+    x = torch.rand(2, 3, 8, 8)
+    KC.CameraSequential(exposure, KC.RandomVignetting(p=1.0))(x)
+    drawn = {name: exposure._params[name] for name in ("stops", "batch_prob", "forward_input_shape")}
+    assert torch.equal(exposure(x, params=exposure._params), exposure(x, params=drawn))

@@ -86,5 +86,5 @@ def test_an_integer_signal_is_refused():
 
 def test_bits_broadcast_against_the_signal() -> None:
     signal = torch.rand(5, 6, generator=torch.Generator().manual_seed(0))
-    found = quantise(signal, bits=torch.tensor([2, 8])[:, None, None])
+    found = quantise(signal, bits=torch.tensor([2, 8], dtype=torch.uint8)[:, None, None])  # 2^8 is no uint8
     assert torch.equal(found, torch.stack([quantise(signal, bits=2), quantise(signal, bits=8)]))

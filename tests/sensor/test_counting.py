@@ -105,7 +105,7 @@ def test_what_cannot_be_counted_so() -> None:
                   torch.tensor([4.0], dtype=torch.float64)):  # fmt: skip
         assert not counting.can_count(means)
     assert counting.can_count(torch.tensor([0.0, 8e6]))
-    assert poisson(torch.tensor([3e7]), generator=seeded(0)).isfinite().all()
+    assert abs(float(poisson(torch.tensor([3e7]), generator=seeded(0))) - 3e7) < 5 * math.sqrt(3e7)
 
 
 def test_torch_s_defaults_do_not_matter() -> None:
