@@ -6,7 +6,6 @@ import dataclasses
 import inspect
 import os
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from kcam.planner import Plan
 
 DEMOSAICING = (isp.Demosaic, isp.LearnedDemosaic)
+DEVELOPING = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve)
+"""The first of these ends the raw signal."""
 ORDER: tuple[type[nn.Module] | tuple[type[nn.Module], ...], ...] = (
     optics.Imaging,
     sensor.ColourFilter,
@@ -88,9 +89,20 @@ class Camera(nn.Module):
                         f"{name} = {_short(value)}. Give it to one of them only; the other takes it over."
                     )
         fields = {name: value for name, (value, _) in given.items()}
+        glasses, told = self._transmissions(), self.context and self.context.colour_filter
+        if glasses:
+            fields["colour_filter"] = fields["colour_filter"].behind(*glasses)
+        elif _same_curves(told, fields.get("colour_filter")):  # a part of a camera that had glasses before the filter
+            fields["colour_filter"] = told
         if isinstance(scene, Scene):
             fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance")}
         return dataclasses.replace(self.context or Context(), **fields, generator=generator)
+
+    def _transmissions(self) -> list[sensor.Transmission]:
+        """Those before the filter; none where there is no filter."""
+        stages = list(self.stages)
+        end = next((index for index, stage in enumerate(stages) if isinstance(stage, sensor.ColourFilter)), 0)
+        return [stage for stage in stages[:end] if isinstance(stage, sensor.Transmission)]
 
     @no_more_than_free()
     def forward(
@@ -157,32 +169,48 @@ class Camera(nn.Module):
         if isinstance(scene, Tensor) and len(self) and isinstance(self[0], (optics.Imaging, sensor.ColourFilter)):
             check_bands(scene, name="image", count=len(context.wavelengths), ndims=(4,), sure=False)
         signal: Any = scene
-        stages = enumerate(pairwise([*self, None]), start=1)
-        for count, (stage, successor) in stages:
-            name = type(stage).__name__
-            if isinstance(stage, optics.Imaging) and isinstance(successor, sensor.ColourFilter):
-                name = f"{name} + {type(successor).__name__}"
-                signal = applied(stage, signal, context, colour_filter=successor)
-                count, _ = next(stages)
+        stages, count = list(self), 0
+        while count < len(stages):
+            stage, taken = stages[count], self.absorbed(count)
+            together = stages[count : count + 1 + taken]
+            if taken:
+                colour_filter: Any = stages[count + taken]
+                glasses = [glass for glass in together if isinstance(glass, sensor.Transmission)]
+                colour_filter = colour_filter.behind(*glasses) if glasses else colour_filter
+                signal = applied(stage, signal, context, colour_filter=colour_filter)
             else:
                 if isinstance(signal, Scene) and not isinstance(stage, optics.Imaging):
                     signal = signal.bands()
                 signal = applied(stage, signal, context)
-            yield count, name, signal
+            count += 1 + taken
+            yield count, " + ".join(type(stage).__name__ for stage in together), signal
+
+    def absorbed(self, index: int) -> int:
+        """How many stages behind one it takes into its own computation: of an Imaging the filter that follows it, and
+        the transmissions before that.
+
+        Example:
+        >>> [Camera.phone().absorbed(index) for index in (0, 1)]
+        [1, 0]
+        """
+        if not isinstance(self[index], optics.Imaging):
+            return 0
+        for count, stage in enumerate(list(self)[index + 1 :], start=1):
+            if isinstance(stage, sensor.ColourFilter):
+                return count
+            if not isinstance(stage, sensor.Transmission):
+                break
+        return 0
 
     def raw(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
         """What the sensor recorded: the signal just before the demosaic, (B,1,H,W), or (B,C,H,W) of full planes; behind
         an ADC 1.0 is full scale. Arguments: as `forward`.
 
-        Raises:    ValueError if the camera has no demosaic.
+        Without a demosaic, such as of a monochrome sensor, it ends before white balance, colour matrix or tone curve,
+        else with the last stage.
         """
-        for index, stage in enumerate(self.stages):
-            if isinstance(stage, DEMOSAICING):
-                return self[:index](scene, generator=generator)
-        raise ValueError(
-            "this camera has no isp.Demosaic or LearnedDemosaic, so nothing marks where its raw signal ends. "
-            "Use a slice: camera[:4](scene)."
-        )
+        end = next((index for index, stage in enumerate(self) if isinstance(stage, DEVELOPING)), len(self))
+        return self[:end](scene, generator=generator)
 
     def linear(self, scene: Scene) -> LinearCamera:
         """The linear part of the camera, from a scene's light to its raw signal, as an operator with its transpose.
@@ -379,6 +407,19 @@ def _check_order(stages: Sequence[nn.Module]) -> None:
         if rank < last:
             raise ValueError(f"{name} stands after {before}, but light passes it first. Move it before {before}.")
         last, before = rank, name
+    glass = sensor.Transmission
+    for stage, *behind in (stages[index:] for index in range(len(stages))):
+        if isinstance(stage, glass) and any(isinstance(one, optics.Imaging) for one in behind):
+            raise ValueError("Transmission stands before Imaging, which takes a scene. Move it behind Imaging.")
+        if isinstance(stage, sensor.ColourFilter) and any(isinstance(one, glass) for one in behind):
+            raise ValueError(
+                "Transmission stands after ColourFilter, which leaves no bands. Move it before ColourFilter."
+            )
+
+
+def _same_curves(told: Any, own: Any) -> bool:
+    """Whether one is the other, maybe behind glass."""
+    return all(isinstance(one, sensor.ColourFilter) for one in (told, own)) and told.coefficients is own.coefficients
 
 
 def is_random(stage: nn.Module) -> bool:

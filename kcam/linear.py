@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam import isp, optics, sensor
-from kcam.camera import DEMOSAICING, Camera, is_random
+from kcam.camera import DEVELOPING, Camera, is_random
 from kcam.context import Context, applied
 from kcam.inputs import describe
 from kcam.optics.linear import LinearImaging, constant_optics
@@ -22,9 +22,7 @@ from kcam.scene import Scene
 from kcam.sensor.noise import like
 from kcam.threads import no_more_than_free
 
-DEVELOPING = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve)
-"""The first of these ends the raw signal."""
-LINEAR = (sensor.ColourFilter, sensor.Mosaic, sensor.Exposure)
+LINEAR = (sensor.Transmission, sensor.ColourFilter, sensor.Mosaic, sensor.Exposure)
 NOISE = (sensor.ShotNoise, sensor.ReadNoise, sensor.FixedPattern, sensor.DarkCurrent)
 RECORDING = (*NOISE, isp.Clip, sensor.ADC)
 """What makes of each pixel's signal what is recorded: linear but for noise, limits and steps."""

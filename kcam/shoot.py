@@ -82,7 +82,7 @@ def shoot(
             check_not_too_near(stage, distance, shape=(scene.shape[1], scene.shape[2]))
     with torch.no_grad():
         picture, plan = within(camera, scene, tolerance=tolerance, generator=torch.Generator().manual_seed(seed))
-    if picture.shape[1] != 3:
+    if picture.shape[1] not in (1, 3):
         raise ValueError(f"the camera gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
     target.parent.mkdir(exist_ok=True)
     plots.write_picture(picture[0].clamp(0, 1), target)

@@ -14,13 +14,18 @@ a band, so E is the lamp's average over each band, not its value at one waveleng
 from __future__ import annotations
 
 import functools
+import itertools
+import math
+import os
 from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.units import nm, wavelength_grid
+from kcam.units import WAVELENGTH_RANGE, nm, wavelength_grid
 
 SINGLE_BAND_WIDTH = 10 * nm
 """Width of a band that has no neighbour to reach half-way to."""
@@ -31,7 +36,161 @@ SENSITIVITIES = ("kodak", "nikon_5100", "sigma_sd_merrill")
 Grid = tuple[float, ...]  # wavelengths in nm, the key of the caches below
 
 
-def illuminant(light: str | Tensor, *, wavelengths: Tensor) -> Tensor:
+class SpectralTable(NamedTuple):
+    """Columns over wavelength, as `read_csv` found them: wavelengths (L,) rising [m], values (C, L), names of columns.
+
+    Example:
+    >>> table = spectral.SpectralTable(torch.tensor([400.0, 500.0]) * nm, torch.tensor([[0.0, 1.0]]), ("white",))
+    >>> table.at(torch.tensor([425.0, 600.0]) * nm)  # linear between, 0 outside
+    tensor([[0.2500, 0.0000]], dtype=torch.float64)
+    """
+
+    wavelengths: Tensor
+    values: Tensor
+    names: tuple[str, ...]
+
+    def at(self, wavelengths: Tensor) -> Tensor:
+        """The columns at other wavelengths (N,) [m]: (C, N) float64, linear between and 0 outside of the table."""
+        return self.values.double() @ interpolation(self.wavelengths, wavelengths)
+
+
+def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> SpectralTable:
+    r"""Read curves over wavelength: a header line, the first column in nanometres, then a column for each curve.
+
+    Columns are parted by commas, semicolons or tabs; empty lines and those that begin with # are passed over. What a
+    column means is for whom it is given to: `illuminant`, `sensor.Transmission`, `sensor.ColourFilter.from_curves`.
+
+    Args:      percent: whether values are percent; they are divided by 100.
+    Returns:   wavelengths (L,) rising float64 [m], values (C, L) float64, the names of the columns.
+    Raises:    ValueError that names the file and the line: without a header or numbers, with rows of unequal length,
+               wavelengths that are no nanometres (micrometres, metres, angstroms) or come twice, values that are no
+               number, not finite or negative, or a header that says percent where `percent` does not;
+               FileNotFoundError.
+
+    Example:
+    >>> from pathlib import Path
+    >>> written = Path("led.csv").write_text("nm, power\\n440, 0\\n450, 1.0\\n470, 0\\n")
+    >>> table = spectral.read_csv("led.csv")
+    >>> (table.wavelengths / nm).round().tolist(), table.values.tolist(), table.names
+    ([440.0, 450.0, 470.0], [[0.0, 1.0, 0.0]], ('power',))
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}. Expected a table of spectra, .csv.")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no text ({error}). Expected a table of spectra: save it as CSV, UTF-8.") from None
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line.strip(",;\t ") and not line.startswith("#")]
+    if len(lines) < 3:
+        raise ValueError(f"{path} has {max(0, len(lines) - 1)} rows behind its header: expected two or more.")
+    (first, header), *rows = lines
+    mark = next((mark for mark in ";\t" if mark in header), ",")
+    names = [name.strip().strip('"') for name in header.split(mark)]
+    if len(names) < 2 or _is_number(names[0]):
+        raise ValueError(f"{path}, line {first}: expected a header such as nm, red, green, blue; got {header[:60]!r}.")
+    said = [name for name in names[1:] if "%" in name or "percent" in name.lower()]
+    if said and not percent:
+        raise ValueError(f"{path}, line {first}: column {said[0]!r} is in percent. Say so: percent=True.")
+    numbers = [_row(path, number, line.split(mark), names) for number, line in rows]
+    table = torch.tensor(numbers, dtype=torch.float64)
+    if table[0, 0] > table[-1, 0]:
+        table, rows = table.flip(0), rows[::-1]
+    _check_nanometres(path, [number for number, _ in rows], table[:, 0].tolist(), names[0])
+    values = table[:, 1:].T.contiguous()
+    return SpectralTable(table[:, 0] * nm, values / 100 if percent else values, tuple(names[1:]))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _row(path: Path, number: int, cells: list[str], names: list[str]) -> list[float]:
+    """The numbers of a line."""
+    if len(cells) != len(names):
+        raise ValueError(
+            f"{path}, line {number}: {len(cells)} columns, and the header has {len(names)} ({', '.join(names)})."
+        )
+    found = []
+    for name, cell in zip(names, cells, strict=True):
+        cell = cell.strip().strip('"')
+        if not _is_number(cell):
+            comma = f" Write {cell.replace(',', '.')} for it." if _is_number(cell.replace(",", ".")) else ""
+            raise ValueError(f"{path}, line {number}: {name} {cell!r} is no number.{comma}")
+        value = float(cell)
+        if not 0 <= value < math.inf:
+            fix = "Measured noise below 0 is no light: write 0." if value < 0 else "Leave the line out."
+            raise ValueError(f"{path}, line {number}: {name} must be finite and >= 0, got {value:g}. {fix}")
+        found.append(value)
+    return found
+
+
+def _check_nanometres(path: Path, lines: list[int], wavelengths: list[float], name: str) -> None:
+    """ValueError unless wavelengths rise, and are nanometres."""
+    low, high = (end / nm for end in WAVELENGTH_RANGE)
+    for number, value in zip(lines, wavelengths, strict=True):
+        if not low <= value <= high:
+            unit = "micrometres: multiply by 1000" if low / 1e3 <= value <= high / 1e3 else "metres: multiply by 1e9"
+            meant = f" They look like {unit}." if 0 < value < low else ""
+            raise ValueError(
+                f"{path}, line {number}: {name} {value:g} is outside {low:g}..{high:g} nm. The first column is in "
+                f"nanometres.{meant}"
+            )
+    if wavelengths[0] >= 2500 and wavelengths[-1] >= 3500:  # silicon ends at 1100 nm, InGaAs at 2600 nm
+        raise ValueError(
+            f"{path}, line {lines[0]}: {name} from {wavelengths[0]:g} to {wavelengths[-1]:g} nm is beyond what any "
+            "silicon sees. They look like angstroms: divide by 10."
+        )
+    for (before, after), number in zip(itertools.pairwise(wavelengths), lines[1:], strict=True):
+        if after <= before:
+            raise ValueError(
+                f"{path}, line {number}: {name} {after:g} nm does not follow {before:g} nm. Sort the lines."
+            )
+
+
+def rising(wavelengths: Tensor, *, either_way: bool = False) -> Tensor:
+    """Wavelengths of a table as float64 on the CPU, (L,) strictly rising, L >= 2; either_way: or falling, then turned.
+
+    Raises:    ValueError for others, or out of range.
+
+    Example:
+    >>> (spectral.rising(torch.tensor([500.0, 400.0]) * nm, either_way=True) / nm).round().tolist()
+    [400.0, 500.0]
+    """
+    grid = wavelength_grid(wavelengths)
+    if len(grid) > 1 and either_way and grid[0] > grid[-1]:
+        grid = grid.flip(0)
+    if len(grid) < 2 or not (grid.diff() > 0).all():
+        shown = ", ".join(f"{value / nm:g}" for value in grid[:5].tolist())
+        raise ValueError(f"a table needs two or more wavelengths that rise, got {shown}{', ...' * (len(grid) > 5)} nm.")
+    return grid
+
+
+def interpolation(nodes: Tensor, points: Tensor) -> Tensor:
+    """Weights (L, N) that interpolate a table linearly: values (C, L) @ weights. 0 outside of the table.
+
+    Args:      nodes: (L,) rising.  points: (N,).
+
+    Example:
+    >>> spectral.interpolation(torch.tensor([0.0, 1.0, 3.0]), torch.tensor([0.5, 2.0, 4.0])).tolist()
+    [[0.5, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.5, 0.0]]
+    """
+    nodes, points = nodes.double().to(points.device), points.double()
+    after = torch.searchsorted(nodes, points, right=True).clamp(1, len(nodes) - 1)
+    share = (points - nodes[after - 1]) / (nodes[after] - nodes[after - 1])
+    inside = (points >= nodes[0]) & (points <= nodes[-1])
+    weights = points.new_zeros(len(nodes), len(points))
+    columns = torch.arange(len(points), device=points.device)
+    weights[after - 1, columns], weights[after, columns] = (1 - share) * inside, share * inside
+    return weights
+
+
+def illuminant(light: str | Tensor | SpectralTable, *, wavelengths: Tensor) -> Tensor:
     """The spectrum of the light on a perfect white, per band, relative: the white has Y = 1.
 
     E_l = average of the lamp over the triangle between band l's neighbours, then adjusted by the smallest relative
@@ -39,7 +198,8 @@ def illuminant(light: str | Tensor, *, wavelengths: Tensor) -> Tensor:
     the 28 default bands. (Samples at the bands would make the white of a fluorescent tube wrong by 7 delta-E2000, of
     the sodium lamp by 14.) No band changes by more than 90 %; more is wanted only where bands miss much of the light.
 
-    Args:      light: a name in `illuminant_names()`, CIE's; or a relative power per band (L,), which is only scaled.
+    Args:      light: a name in `illuminant_names()`, CIE's; a lamp that was measured, a table of one column such as
+               `read_csv` gives, dark outside of it; or a relative power per band (L,), which is only scaled.
                wavelengths: (L,) [m].
     Returns:   (L,) float64; all ones for "E", equal energy.
     Raises:    ValueError for an unknown name, or a power that is negative, not finite, all zero or of another length;
@@ -55,8 +215,13 @@ def illuminant(light: str | Tensor, *, wavelengths: Tensor) -> Tensor:
     grid = _grid(wavelengths)
     if isinstance(light, str):
         return torch.tensor(_lamp(light, grid))
+    if isinstance(light, SpectralTable):
+        return torch.tensor(_on_bands(*_measured_at_1nm(light, grid), grid))
     if not isinstance(light, Tensor):
-        raise TypeError(f"illuminant must be a name such as 'D65' or a tensor (L,), got {type(light).__name__}.")
+        raise TypeError(
+            f"illuminant must be a name such as 'D65', a tensor (L,) or a table of spectral.read_csv, got "
+            f"{type(light).__name__}."
+        )
     power = light.detach().double().cpu()
     if power.shape != (len(grid),):
         raise ValueError(f"illuminant has shape {tuple(power.shape)}, expected one value per band: ({len(grid)},).")
@@ -336,12 +501,12 @@ def _lamp_at_1nm(name: str) -> np.ndarray:
     return np.interp(_table("observer")["wavelengths"], table["wavelengths"], table["values"][names.index(name)])
 
 
-def _band_averages(curves: np.ndarray, grid: Grid) -> np.ndarray:
-    """Curves (..., 471) at the observer's steps of 1 nm, averaged over the triangle of each band: (..., L).
+def _band_averages(curves: np.ndarray, grid: Grid, fine: np.ndarray | None = None) -> np.ndarray:
+    """Curves (..., N) in steps of 1 nm, by default the observer's 471, averaged over each band's triangle: (..., L).
 
     The triangles of the outermost bands are symmetric, as are their widths in `band_widths`.
     """
-    bands, fine = np.array(grid), _table("observer")["wavelengths"]
+    bands, fine = np.array(grid), _table("observer")["wavelengths"] if fine is None else fine
     order = np.argsort(bands)
     nodes = bands[order]
     first, last = (nodes[1] - nodes[0], nodes[-1] - nodes[-2]) if len(nodes) > 1 else [SINGLE_BAND_WIDTH / nm] * 2
@@ -352,12 +517,46 @@ def _band_averages(curves: np.ndarray, grid: Grid) -> np.ndarray:
     return curves @ (triangles / triangles.sum(axis=1, keepdims=True)).T
 
 
+def _measured_at_1nm(light: SpectralTable, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """A lamp of a table in steps of 1 nm that reach over the eye's and all bands: mean powers, and where [nm]."""
+    if len(light.values) != 1:
+        raise ValueError(
+            f"an illuminant has one column, and this table {len(light.values)} ({', '.join(light.names)}). Take one: "
+            "table._replace(values=table.values[:1], names=table.names[:1])."
+        )
+    nodes, power = (part.double().numpy() for part in (light.wavelengths / nm, light.values[0]))
+    if not (np.isfinite(power).all() and (power >= 0).all() and power.any()):
+        raise ValueError(f"illuminant must be finite, >= 0 and not all zero, got {power.min():g} to {power.max():g}.")
+    eye = _table("observer")["wavelengths"]
+    if nodes[-1] < eye[0] or nodes[0] > eye[-1]:
+        raise ValueError(
+            f"the illuminant has light from {nodes[0]:.0f} to {nodes[-1]:.0f} nm, where the eye sees none, so its "
+            "white has no luminance. Give a relative power per band (L,) with some in 360..830 nm."
+        )
+    fine = np.arange(min(eye[0], math.floor(min(grid) - 50)), max(eye[-1], math.ceil(max(grid) + 50)) + 1)
+    area = np.concatenate([[0.0], np.cumsum(np.diff(nodes) * (power[1:] + power[:-1]) / 2)])
+
+    def integral(ends: np.ndarray) -> np.ndarray:
+        ends = np.clip(ends, nodes[0], nodes[-1])
+        before = np.clip(np.searchsorted(nodes, ends, side="right") - 1, 0, len(nodes) - 2)
+        step = ends - nodes[before]
+        slope = np.diff(power)[before] / np.diff(nodes)[before]
+        return area[before] + step * (power[before] + slope * step / 2)
+
+    return integral(fine + 0.5) - integral(fine - 0.5), fine
+
+
 @functools.lru_cache(maxsize=64)
 def _lamp(name: str, grid: Grid) -> np.ndarray:
-    lamp, matching_1nm = _lamp_at_1nm(name), _table("observer")["values"]
+    return _on_bands(_lamp_at_1nm(name), _table("observer")["wavelengths"], grid)
+
+
+def _on_bands(lamp: np.ndarray, fine: np.ndarray, grid: Grid) -> np.ndarray:
+    """The power of a lamp, in steps of 1 nm, on bands."""
+    matching_1nm = observer(torch.tensor(fine) * nm).numpy()
     white = lamp @ matching_1nm / (lamp @ matching_1nm[:, 1])
     matching = _colour_matching(grid)
-    power = _band_averages(lamp, grid)
+    power = _band_averages(lamp, grid, fine)
     power = power / (power @ matching[:, 1])
     relative = power[:, None] * matching  # d XYZ by a relative change of each band; least squares keeps it small
     change = np.linalg.lstsq(relative.T, white - relative.sum(axis=0), rcond=None)[0]

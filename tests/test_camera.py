@@ -194,9 +194,11 @@ def test_steps_raw_and_slices_agree() -> None:
         assert torch.equal(signals[-1], camera[cut:](camera[:cut](scene, generator=g), generator=g)), cut
 
 
-def test_no_raw() -> None:
-    with pytest.raises(ValueError, match="no isp.Demosaic or LearnedDemosaic.*Use a slice"):
-        Camera.ideal().raw(rgb_scene())
+def test_the_raw_of_a_camera_without_a_demosaic_ends_before_it_is_developed() -> None:
+    ideal, scene = Camera.ideal(), rgb_scene()
+    assert torch.equal(ideal.raw(scene), ideal[:2](scene))
+    bare = Camera(sensor.ColourFilter.kodak(), sensor.Mosaic("RGGB"))
+    assert torch.equal(bare.raw(scene), bare(scene))
 
 
 def test_absorbed_filter_gives_the_staged_result() -> None:

@@ -132,7 +132,7 @@ class TestIlluminant:
     def test_errors(self) -> None:
         with pytest.raises(ValueError, match=r"unknown illuminant 'D66'. There are: A, C, D50.*or give a tensor"):
             spectral.illuminant("D66", wavelengths=DEFAULT)
-        with pytest.raises(TypeError, match=r"must be a name such as 'D65' or a tensor \(L,\), got int"):
+        with pytest.raises(TypeError, match=r"must be a name such as 'D65', a tensor \(L,\) or a table .*, got int"):
             spectral.illuminant(65, wavelengths=DEFAULT)
         with pytest.raises(ValueError, match=r"shape \(27,\), expected one value per band: \(28,\)"):
             spectral.illuminant(torch.ones(27), wavelengths=DEFAULT)

@@ -39,7 +39,7 @@ from kcam.planner.plan import (
 from kcam.planner.spectra import LINEAR, Spectra, linear
 from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
-from kcam.sensor import ADC, ColourFilter
+from kcam.sensor import ADC
 from kcam.sensor.noise import RandomStage
 
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
@@ -217,7 +217,7 @@ class Evaluator:
         """
         if self.imaging is None or not self.varies:
             return {}
-        colours: Any = next((stage for stage in self.camera if isinstance(stage, ColourFilter)), None)
+        colours: Any = self.camera.resolve().colour_filter
         return {"spacing": min(self.imaging.apart(scene, colour_filter=colours) for scene in self.scenes)}
 
     @property

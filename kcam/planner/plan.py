@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from kcam import files
-from kcam.camera import DEMOSAICING, Camera
+from kcam.camera import DEVELOPING, Camera
 from kcam.context import Context
 from kcam.optics import Imaging
 from kcam.optics.accuracy import OVER_THE_FIELD
@@ -26,7 +26,7 @@ from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
 
-ENDS = (ADC, *DEMOSAICING)
+ENDS = (ADC, *DEVELOPING)
 """What stands before the first of these is the raw signal, before rounding."""
 
 SAFETY = 1.25

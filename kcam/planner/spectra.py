@@ -30,7 +30,7 @@ from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.source import Points
 from kcam.scene import Scene
-from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, ShotNoise
+from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, ShotNoise, Transmission
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import Mean
 
@@ -343,7 +343,7 @@ def even_counts(total: int) -> list[int]:
 
 def linear(camera: Camera) -> bool:
     """Whether a camera's noiseless raw is linear in light that is not clipped, and its PSF one all over."""
-    known = (Clip, ColourFilter, DarkCurrent, Exposure, Imaging, Mosaic, ReadNoise, ShotNoise)
+    known = (Clip, ColourFilter, DarkCurrent, Exposure, Imaging, Mosaic, ReadNoise, ShotNoise, Transmission)
     stages = [stage.stage if isinstance(stage, Mean) else stage for stage in camera]
     one = all(getattr(stage.lens, "positions", None) is None for stage in stages if isinstance(stage, Imaging))
     return one and all(isinstance(stage, known) for stage in stages)
@@ -354,7 +354,8 @@ def _recorded(camera: Camera, scene: Scene) -> Tensor | None:
     weights, pairs = None, None
     for stage in camera:
         if isinstance(stage, ColourFilter):
-            weights = stage.contraction(scene.wavelengths).detach().double().cpu()
+            seen: Any = camera.resolve(scene).colour_filter  # the same, behind what stands before it
+            weights = seen.contraction(scene.wavelengths).detach().double().cpu()
             pairs = torch.eye(len(weights), dtype=torch.float64)
             if stage.is_tile:
                 alpha = stage.alpha().detach().double().cpu().flatten(0, 1)

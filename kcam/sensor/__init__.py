@@ -16,6 +16,7 @@ from kcam.sensor.noise import (
     read_noise,
     shot_noise,
 )
+from kcam.sensor.transmission import Transmission
 
 __all__ = [
     "ADC",
@@ -28,6 +29,7 @@ __all__ = [
     "Mosaic",
     "ReadNoise",
     "ShotNoise",
+    "Transmission",
     "channel_masks",
     "dark_current",
     "fit_gaussians",

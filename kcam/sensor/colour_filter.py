@@ -1,4 +1,4 @@
-"""Colour filters as sums of Gaussians: fitted curves, and the tile that learns.
+"""Colour filters: sums of Gaussians, tables of measured curves, and the tile that learns.
 
 kappa(lambda) = sum_i alpha_i N(lambda; mu_i, sigma),   i = 1..12                                     (thesis, eq. 3.9)
 
@@ -6,14 +6,19 @@ with centres mu_i equally spaced over 420..720 nm and one common sigma. Waveleng
 spacing, Delta = 300 / 11 nm, so N = Delta / (sigma sqrt(2 pi)) exp(-(lambda - mu_i)^2 / 2 sigma^2): the twelve then add
 up to about 1, and alpha_i is about the curve's own value near mu_i.
 
-A curve is a response per unit *energy* (irradiance, not photons), with the peak of green at 1.
+A table has triangles between its own wavelengths in their place, so that alpha are the measured values and a curve is
+linear between them. A curve is a response per unit *energy* (irradiance, not photons), with the peak of green at 1;
+a table of quantum efficiencies is per photon, and what it gives per energy is lambda / 550 nm times that.
 """
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
-from typing import NamedTuple
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import scipy
 import torch
@@ -26,6 +31,7 @@ from kcam.inputs import band_remedy, check_signal
 from kcam.precision import full_precision
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import hold
+from kcam.sensor.transmission import Transmission
 from kcam.units import check_trained, nm, wavelength_grid
 
 BASIS_SIZE = 12
@@ -36,6 +42,9 @@ REFERENCE_BANDWIDTH = 100 * nm
 
 INFRARED_EDGE = 8 * nm
 """Scale of the infrared cut: its transmission falls from 90 to 10 % over 4.4 times this, 35 nm."""
+
+PHOTON_WAVELENGTH = 550 * nm
+"""Where a response per energy is the quantum efficiency itself."""
 
 SHARPNESS = 10.0
 """Of the learned tile's softplus: alpha = softplus(10 x) / 10 is about x above 0.2, and its slope at 0.01 is 0.1."""
@@ -136,10 +145,15 @@ class ColourFilter(Stage):
     - a tile (t,t,12): one curve per pixel, repeated over the sensor from its top left corner (eq. 3.9); (B,L,H,W) to
       the mosaiced plane (B,1,H,W). No Mosaic follows it.
 
+    Of curves that are measured (`from_curves`, `from_csv`), alpha are their values at `nodes`, (C,N).
+
     Args:      coefficients: alpha >= 0, or with `softplus` unconstrained values x with alpha = softplus(10 x) / 10.
                    An nn.Parameter trains; without `softplus` nothing but the start keeps it from going negative.
                softplus: whether the coefficients pass through the softplus, so that alpha > 0 whatever is learnt.
                width: common standard deviation sigma of the Gaussians [m].
+               nodes: wavelengths (N,) of a table, rising [m], instead of Gaussians.
+               photons: whether alpha are electrons per photon: a response per energy is lambda / 550 nm times that.
+               transmissions: what stands before the sensor, such as an infrared cut: see `behind`.
                infrared_cut: wavelength of half transmission of an infrared cut filter [m], see
                    `infrared_transmission`; None for no cut beyond what the curves themselves hold.
     Raises:    ValueError for coefficients of another shape, negative or not finite, or a length out of range;
@@ -155,6 +169,8 @@ class ColourFilter(Stage):
     coefficients: Tensor
     softplus: bool
     width: float
+    nodes: Tensor | None
+    photons: bool
     infrared_cut: Tensor | float | None
 
     def __init__(
@@ -163,15 +179,20 @@ class ColourFilter(Stage):
         *,
         softplus: bool = False,
         width: float = 18 * nm,
+        nodes: Tensor | None = None,
+        photons: bool = False,
         infrared_cut: Tensor | float | None = None,
+        transmissions: Sequence[Transmission] = (),
     ):
         super().__init__()
         if not (isinstance(coefficients, Tensor) and coefficients.is_floating_point()):
             raise TypeError(f"coefficients must be a floating-point tensor, got {_describe(coefficients)}.")
-        if coefficients.ndim not in (2, 3) or coefficients.shape[-1] != BASIS_SIZE or coefficients.numel() == 0:
+        nodes = None if nodes is None else spectral.rising(nodes)
+        size, what = (BASIS_SIZE, "Gaussian") if nodes is None else (len(nodes), "wavelength of the table")
+        if coefficients.ndim not in (2, 3) or coefficients.shape[-1] != size or coefficients.numel() == 0:
             raise ValueError(
-                f"coefficients must be curves (C, {BASIS_SIZE}) or a tile (t, t, {BASIS_SIZE}), one value per "
-                f"Gaussian, got shape {tuple(coefficients.shape)}."
+                f"coefficients must be curves (C, {size}) or a tile (t, t, {size}), one value per "
+                f"{what}, got shape {tuple(coefficients.shape)}."
             )
         if not coefficients.isfinite().all() or (not softplus and (coefficients < 0).any()):
             raise ValueError(
@@ -186,6 +207,77 @@ class ColourFilter(Stage):
         if infrared_cut is not None:
             wavelength_grid(torch.as_tensor(infrared_cut))
         hold(self, coefficients=coefficients, softplus=softplus, width=width, infrared_cut=infrared_cut)
+        self.nodes, self.photons = nodes, photons  # no buffer: half precision has no number so small
+        self.transmissions: Any = nn.ModuleList(transmissions) if len(transmissions) else ()
+
+    @classmethod
+    def from_curves(
+        cls, wavelengths: Tensor, curves: Tensor, *, quantum_efficiency: bool = False, trainable: bool = False
+    ) -> ColourFilter:
+        """Measured curves, interpolated as they are: linear between their wavelengths, and 0 outside of them.
+
+        Args:      wavelengths: (L,) at any distances, rising or falling [m].
+                   curves: (C, L) >= 0, any number of channels: relative, per unit of energy; or electrons per photon.
+                   quantum_efficiency: whether they are electrons per photon, 0..1. `Exposure(time=...)` then counts
+                       with them as they are. trainable: see `trainable`.
+        Raises:    ValueError for wavelengths out of range or that do not rise, curves of another shape, negative or not
+                   finite, above 2, or above 1 electron per photon (percent?); TypeError for what is no tensor.
+        Valid when the bands of a scene are about as close as the table has structure: each stands for the curve's value
+                   at its own wavelength. Light outside of the table is not seen.
+
+        Example:
+        >>> wavelengths = torch.tensor([400.0, 500.0, 600.0, 1000.0]) * nm
+        >>> silicon = sensor.ColourFilter.from_curves(wavelengths, torch.tensor([[0.3, 0.6, 0.6, 0.1]]))
+        >>> silicon.response(torch.tensor([450.0, 800.0, 1100.0]) * nm)  # half-way, half-way, and outside
+        tensor([[0.4500, 0.3500, 0.0000]], dtype=torch.float64)
+        """
+        nodes = spectral.rising(wavelengths, either_way=True)
+        if not isinstance(curves, Tensor) or curves.ndim != 2 or curves.shape[1] != len(nodes) or not len(curves):
+            got = tuple(curves.shape) if isinstance(curves, Tensor) else _describe(curves)
+            raise ValueError(f"curves must be a tensor (C, {len(nodes)}), one value per wavelength, got {got}.")
+        values = curves.detach().double().cpu()
+        most, unit = (1.0, " electrons per photon") if quantum_efficiency else (2.0, "")
+        if not values.isfinite().all() or (values < 0).any() or (values > most).any():
+            high = float(values.nan_to_num(0).max())
+            percent = " Percent? Then divide by 100: curves / 100, or percent=True for a file." if high > most else ""
+            raise ValueError(
+                f"curves must be finite, >= 0 and at most {most:g}{unit}, got {values.min():g} to {values.max():g}."
+                f"{percent or ' Measured noise below 0 is no light: clamp it, curves.clamp(min=0).'}"
+            )
+        if not values.any():
+            raise ValueError("curves are all 0: this sensor sees nothing. Give its responses, such as 0.5 at 550 nm.")
+        if float(wavelengths[0]) > float(wavelengths[-1]):
+            values = values.flip(1)
+        made = cls(values.float(), nodes=nodes, photons=quantum_efficiency)
+        return made.trainable() if trainable else made
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        quantum_efficiency: bool = False,
+        percent: bool = False,
+        trainable: bool = False,
+    ) -> ColourFilter:
+        r"""Curves from a table: a header line, the first column in nanometres, then a column for each channel.
+
+        Args:      as of `from_curves`, and `spectral.read_csv`.
+        Raises:    as they do; errors name the line.
+
+        Example:
+        >>> from pathlib import Path
+        >>> written = Path("qe.csv").write_text("nm, red, green, blue\\n400, 0, 0.1, 0.4\\n700, 0.5, 0, 0\\n")
+        >>> sensor.ColourFilter.from_csv("qe.csv", quantum_efficiency=True).coefficients.shape
+        torch.Size([3, 2])
+        """
+        table = spectral.read_csv(path, percent=percent)
+        try:
+            return cls.from_curves(
+                table.wavelengths, table.values, quantum_efficiency=quantum_efficiency, trainable=trainable
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     @classmethod
     def kodak(cls, *, infrared_cut: float | None = None) -> ColourFilter:
@@ -249,8 +341,19 @@ class ColourFilter(Stage):
         """
         alpha = self.alpha().detach().double().clamp(min=LEAST_ALPHA)
         raw = alpha + torch.log(-torch.expm1(-SHARPNESS * alpha)) / SHARPNESS
-        cut = self.infrared_cut
-        return ColourFilter(nn.Parameter(raw.float()), softplus=True, width=self.width, infrared_cut=cut)
+        names = ("width", "nodes", "photons", "infrared_cut", "transmissions")
+        kept = {name: getattr(self, name) for name in names}
+        return ColourFilter(nn.Parameter(raw.float()), softplus=True, **kept)
+
+    def behind(self, *transmissions: Transmission) -> ColourFilter:
+        """The same filter behind glasses, cuts and other transmissions: it shares its coefficients.
+
+        A `Camera` does so by itself with those that stand before its filter.
+        """
+        made = copy.copy(self)
+        made.__dict__.pop("transmissions", None)
+        made._modules = {"transmissions": nn.ModuleList([*self.transmissions, *transmissions])}
+        return made
 
     @classmethod
     def _fitted(cls, name: str, infrared_cut: float | None) -> ColourFilter:
@@ -263,7 +366,7 @@ class ColourFilter(Stage):
         return self.coefficients.ndim == 3
 
     def alpha(self) -> Tensor:
-        """The weights of the Gaussians, (C,12) or (t,t,12), >= 0.
+        """The weights of the Gaussians, (C,12) or (t,t,12), or of a table its values, (C,N), >= 0.
 
         Raises:    ValueError for coefficients that were trained or loaded into NaN.
         """
@@ -271,9 +374,18 @@ class ColourFilter(Stage):
         return F.softplus(self.coefficients, beta=SHARPNESS) if self.softplus else self.coefficients
 
     def basis(self, wavelengths: Tensor) -> Tensor:
-        """The Gaussians behind the infrared cut, (12,L) float64."""
+        """The Gaussians, or the triangles of a table, behind the infrared cut and all else before them, (12,L) or
+        (N,L) float64.
+        """
         grid = wavelength_grid(wavelengths).to(self.coefficients.device)
-        basis = gaussian_basis(grid, width=self.width)
+        if self.nodes is None:
+            basis = gaussian_basis(grid, width=self.width)
+        else:
+            basis = spectral.interpolation(self.nodes, grid)
+        if self.photons:
+            basis = basis * (grid / PHOTON_WAVELENGTH)
+        for transmission in self.transmissions:
+            basis = basis * transmission.transmission(grid)
         if self.infrared_cut is not None:
             check_trained(torch.as_tensor(self.infrared_cut), name="infrared_cut of the colour filter")
             basis = basis * infrared_transmission(grid, edge=self.infrared_cut)
@@ -301,7 +413,8 @@ class ColourFilter(Stage):
 
         forward(bands) = finish(sum_l contraction[k, l] bands[:, l])
 
-        Returns:   (K,L) float64, K = C for curves and 12 for a tile, whose coefficients are applied by `finish`.
+        Returns:   (K,L) float64, K = C for curves and 12 for a tile of Gaussians, whose coefficients are applied by
+                   `finish`.
         """
         basis = self.basis(wavelengths) * _shares(wavelengths).to(self.coefficients.device)
         return basis if self.is_tile else self.alpha().double() @ basis
@@ -314,7 +427,7 @@ class ColourFilter(Stage):
         Raises:    ValueError for another number of planes.
         """
         alpha = self.alpha()
-        count = BASIS_SIZE if self.is_tile else alpha.shape[0]
+        count = alpha.shape[-1] if self.is_tile else alpha.shape[0]
         if planes.ndim < 3 or planes.shape[-3] != count:
             raise ValueError(
                 f"finish expects the {count} planes of the contraction, (..., {count}, H, W), "
@@ -353,9 +466,13 @@ class ColourFilter(Stage):
         return {"colour_filter": self}
 
     def extra_repr(self) -> str:
-        """The shape of the coefficients and the cut."""
+        """The shape of the coefficients, what they are of, and the cut."""
         cut = "" if self.infrared_cut is None else f", infrared_cut={torch.as_tensor(self.infrared_cut).item():g}"
-        return f"{tuple(self.coefficients.shape)}, softplus={self.softplus}, width={self.width:g}{cut}"
+        of = f", width={self.width:g}"
+        if self.nodes is not None:
+            first, last = (float(end) / nm for end in self.nodes[[0, -1]])
+            of = f", {first:.0f}..{last:.0f} nm{', photons=True' if self.photons else ''}"
+        return f"{tuple(self.coefficients.shape)}, softplus={self.softplus}{of}{cut}"
 
 
 def _shares(wavelengths: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal
-from kcam.sensor.colour_filter import REFERENCE_BANDWIDTH, ColourFilter
+from kcam.sensor.colour_filter import PHOTON_WAVELENGTH, REFERENCE_BANDWIDTH, ColourFilter
 from kcam.sensor.noise import hold
 from kcam.units import as_numbers, check_positive, nm
 
@@ -22,6 +22,10 @@ LUMINOUS_EFFICACY = 683.002
 
 LUMINOUS_BANDWIDTH = 106.856895e-9
 """Integral of ybar of the CIE 1931 2 degree observer over 360..830 nm [m]: CIE 018."""
+
+
+DEFAULT_QUANTUM_EFFICIENCY = 0.5
+"""Of green's peak [electrons / photon], of curves that are only known in proportion."""
 
 
 def white_gain(*, white: Tensor, white_share: Tensor | float, gain: Tensor | float = 1.0) -> Tensor:
@@ -98,7 +102,8 @@ class Exposure(Stage):
     Args:      white_share: of full scale, 0 < share <= 1; None for the context's (0.8).
                time: exposure time [s]; None for automatic exposure.
                iso: sensitivity, gain = iso / 100; None for the context's gain (1).
-               quantum_efficiency: peak of green [electrons / photon], 0 < q <= 1; only used with `time`.
+               quantum_efficiency: peak of green [electrons / photon], 0 < q <= 1; only used with `time`. None for the
+               filter's own where it knows them (`ColourFilter.from_curves(..., quantum_efficiency=True)`), else 0.5.
     Raises:    ValueError for a value out of range, and at the call for `time` without a lens in the context.
 
     Example:
@@ -110,7 +115,7 @@ class Exposure(Stage):
     white_share: Tensor | float | None
     time: Tensor | float | None
     iso: Tensor | float | None
-    quantum_efficiency: Tensor | float
+    quantum_efficiency: Tensor | float | None
 
     def __init__(
         self,
@@ -118,7 +123,7 @@ class Exposure(Stage):
         *,
         time: Tensor | float | None = None,
         iso: Tensor | float | None = None,
-        quantum_efficiency: Tensor | float = 0.5,
+        quantum_efficiency: Tensor | float | None = None,
     ):
         super().__init__()
         for name, share in (("white_share", white_share), ("quantum_efficiency", quantum_efficiency)):
@@ -152,16 +157,21 @@ class Exposure(Stage):
                 f"Exposure(time=...) needs aperture_area= and sensor_distance= of the {type(context.lens).__name__}. "
                 "Give them, or leave time=None for automatic exposure."
             )
-        grid = torch.arange(400, 741, dtype=torch.float64) * nm
+        grid = torch.arange(300, 1101, dtype=torch.float64) * nm
+        response, peak = _green(colour_filter.response(grid)), self.quantum_efficiency
+        if peak is None:
+            peak = DEFAULT_QUANTUM_EFFICIENCY
+            if getattr(colour_filter, "photons", False):  # per photon it is what it says
+                response, peak = grid / PHOTON_WAVELENGTH, 1.0
         electrons = electrons_per_unit(
-            response=_green(colour_filter.response(grid)),
+            response=response,
             wavelengths=grid,
             luminance=context.luminance,
             aperture_area=area,
             sensor_distance=distance,
             pixel_area=context.pixel_pitch**2 * context.fill_factor,
             time=self.time,
-            quantum_efficiency=self.quantum_efficiency,
+            quantum_efficiency=peak,
         )
         return electrons / context.full_well
 
