@@ -69,7 +69,7 @@ def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> Spectral
 
     Example:
     >>> from pathlib import Path
-    >>> written = Path("led.csv").write_text("nm, power\\n440, 0\\n450, 1.0\\n470, 0\\n")
+    >>> written = Path("led.csv").write_text("nm, power\n440, 0\n450, 1.0\n470, 0\n")
     >>> table = spectral.read_csv("led.csv")
     >>> (table.wavelengths / nm).round().tolist(), table.values.tolist(), table.names
     ([440.0, 450.0, 470.0], [[0.0, 1.0, 0.0]], ('power',))
@@ -183,10 +183,10 @@ def interpolation(nodes: Tensor, points: Tensor) -> Tensor:
     nodes, points = nodes.double().to(points.device), points.double()
     after = torch.searchsorted(nodes, points, right=True).clamp(1, len(nodes) - 1)
     share = (points - nodes[after - 1]) / (nodes[after] - nodes[after - 1])
-    inside = (points >= nodes[0]) & (points <= nodes[-1])
+    share, rest = (torch.where((points >= nodes[0]) & (points <= nodes[-1]), part, 0.0) for part in (share, 1 - share))
     weights = points.new_zeros(len(nodes), len(points))
     columns = torch.arange(len(points), device=points.device)
-    weights[after - 1, columns], weights[after, columns] = (1 - share) * inside, share * inside
+    weights[after - 1, columns], weights[after, columns] = rest, share
     return weights
 
 

@@ -28,7 +28,7 @@ LAYERS = [
     {"kcam.isp"},
     {"kcam.camera"},
     {"kcam.planner", "kcam.linear"},
-    {"kcam.augmentation", "kcam.data"},
+    {"kcam.augmentation", "kcam.data", "kcam.calibration"},
     {"kcam.style"},
     {"kcam.tradeoff"},
     {"kcam.plots"},

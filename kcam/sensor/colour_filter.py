@@ -267,7 +267,7 @@ class ColourFilter(Stage):
 
         Example:
         >>> from pathlib import Path
-        >>> written = Path("qe.csv").write_text("nm, red, green, blue\\n400, 0, 0.1, 0.4\\n700, 0.5, 0, 0\\n")
+        >>> written = Path("qe.csv").write_text("nm, red, green, blue\n400, 0, 0.1, 0.4\n700, 0.5, 0, 0\n")
         >>> sensor.ColourFilter.from_csv("qe.csv", quantum_efficiency=True).coefficients.shape
         torch.Size([3, 2])
         """

@@ -30,8 +30,8 @@ class Transmission(Stage):
     Source:    ASTM E308, for values beyond the ends of a table.
 
     Example:
-    >>> cut = sensor.Transmission(torch.tensor([640.0, 680.0]) * nm, torch.tensor([1.0, 0.0]))  # of infrared
-    >>> cut.transmission(torch.tensor([550.0, 660.0, 720.0]) * nm).tolist()
+    >>> infrared_cut = sensor.Transmission(torch.tensor([640.0, 680.0]).double() * nm, torch.tensor([1.0, 0.0]))
+    >>> infrared_cut.transmission(torch.tensor([550.0, 660.0, 720.0]).double() * nm).tolist()
     [1.0, 0.5, 0.0]
     """
 
@@ -59,7 +59,7 @@ class Transmission(Stage):
 
         Example:
         >>> from pathlib import Path
-        >>> written = Path("glass.csv").write_text("nm, T [%]\\n400, 0\\n500, 92\\n")
+        >>> written = Path("glass.csv").write_text("nm, T [%]\n400, 0\n500, 92\n")
         >>> sensor.Transmission.from_csv("glass.csv", percent=True).values
         tensor([0.0000, 0.9200], dtype=torch.float64)
         """
