@@ -95,7 +95,7 @@ class Camera(nn.Module):
         elif _same_curves(told, fields.get("colour_filter")):  # a part of a camera that had glasses before the filter
             fields["colour_filter"] = told
         if isinstance(scene, Scene):
-            fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance")}
+            fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance", "depth")}
         return dataclasses.replace(self.context or Context(), **fields, generator=generator)
 
     def _transmissions(self) -> list[sensor.Transmission]:

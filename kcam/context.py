@@ -51,9 +51,11 @@ class Context:
         wavelengths: (L,) float64 [m].
         illuminant: (L,) relative spectral power of the light on a perfect white, or None for D65.
         luminance: of a perfect white [cd/m^2].
+        depth: of what is seen, as a `Scene` has it [m]; None where there is no scene.
         generator: source of all randomness, or None for torch's default one.
     Fields that stages set when the camera is built:
         lens, pixel_pitch [m], fill_factor: the optics, for photometry.
+        exposure_time [s], or None where nobody says.
         colour_filter: the filter whose curves white balance, exposure and colour matrix use.
         pattern: name of the mosaic.
         full_well [electrons], gain (analogue, 1 at base ISO), white_share (of full scale), black_level (of full scale).
@@ -68,9 +70,11 @@ class Context:
     illuminant: Tensor | None = None
     luminance: float = 1000.0
     generator: torch.Generator | None = None
+    depth: Tensor | float | None = None
     lens: Photometric | None = None
     pixel_pitch: float = 4e-6
     fill_factor: float = 1.0
+    exposure_time: Tensor | float | None = None
     colour_filter: Curves | None = None
     pattern: str = "RGGB"
     full_well: float = 10_000.0

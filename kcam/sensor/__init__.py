@@ -5,6 +5,7 @@ from kcam.sensor.calibrated import from_calibration
 from kcam.sensor.colour_filter import ColourFilter, fit_gaussians
 from kcam.sensor.exposure import Exposure
 from kcam.sensor.mosaic import PATTERNS, Mosaic, channel_masks, mosaic
+from kcam.sensor.motion import Motion, move_rows, path_blur, tremor, warp
 from kcam.sensor.noise import (
     DarkCurrent,
     FixedPattern,
@@ -28,6 +29,7 @@ __all__ = [
     "FixedPattern",
     "Mean",
     "Mosaic",
+    "Motion",
     "ReadNoise",
     "ShotNoise",
     "Transmission",
@@ -37,8 +39,12 @@ __all__ = [
     "fixed_pattern",
     "from_calibration",
     "mosaic",
+    "move_rows",
+    "path_blur",
     "poisson",
     "quantise",
     "read_noise",
     "shot_noise",
+    "tremor",
+    "warp",
 ]

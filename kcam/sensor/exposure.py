@@ -181,8 +181,9 @@ class Exposure(Stage):
         return signal * self.factor(context).to(signal)
 
     def provides(self) -> dict[str, Any]:
-        """The gain and the white share, where they were given."""
+        """The gain, the exposure time and the white share, where they were given."""
         fields: dict[str, Any] = {} if self.iso is None else {"gain": self.iso / 100}
+        fields |= {} if self.time is None else {"exposure_time": self.time}
         return fields if self.white_share is None else {**fields, "white_share": self.white_share}
 
 
