@@ -157,4 +157,4 @@ class RowColumnNoise(RandomStage):
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Two sums over the signal; what is drawn is few."""
-        return 4.0
+        return 2.0

@@ -72,11 +72,10 @@ def crosstalk(signal: Tensor, *, optical: Tensor | float, electrical: Tensor | f
     >>> [round(float(mixed[0, 0, 2, column]), 2) for column in range(4)]  # the greens beside it
     [0.0, 0.05, 0.8, 0.05]
     """
-    own = {"optical": optical, "electrical": electrical}
-    light, electrons = (at_pixels(value, signal, pattern=pattern, name=name).to(signal) for name, value in own.items())
     if not signal.numel():
         return signal * 1.0
-    middle, side, corner = _shares(light, electrons)
+    shares = _shares(*(torch.as_tensor(value).to(signal) for value in (optical, electrical)))
+    middle, side, corner = (at_pixels(share, signal, pattern=pattern, name="crosstalk") for share in shares)
     height, width = signal.shape[-2:]
     beside, across = (_around(signal * share) for share in (side, corner))
 
@@ -156,7 +155,7 @@ class Crosstalk(Stage):
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Passes over the signal."""
-        return 20.0
+        return 12.0
 
     def reason(self, signal: Tensor, context: Context | None = None) -> str:
         """What a pixel loses at most."""

@@ -148,7 +148,7 @@ class DefectPixels(Stage):
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Two random numbers for each pixel, and a logarithm."""
-        return 40.0
+        return 25.0
 
     def reason(self, signal: Tensor, context: Context | None = None) -> str:
         """How many there are in a megapixel."""

@@ -62,16 +62,15 @@ def at_pixels(values: Tensor | float, signal: Tensor, *, pattern: str, name: str
                a mosaic.  pattern: its name.  name: of the values, for the error.
     Raises:    ValueError for another number of values.
     """
-    found = torch.as_tensor(values, device=signal.device).flatten()
+    dtype = values.dtype if isinstance(values, Tensor) else torch.float64
+    found = torch.as_tensor(values, dtype=dtype, device=signal.device).flatten()
     planes, height, width = signal.shape[-3:]
     if len(found) in (1, planes):
         return found[:, None, None]
     tile = pattern_tile(pattern).to(found.device)
     if planes == 1 and len(found) == int(tile.max()) + 1:
-        rows, columns = (
-            torch.arange(n, device=found.device) % m for n, m in zip((height, width), tile.shape, strict=True)
-        )
-        return found[tile[rows[:, None], columns]][None]
+        rows, columns = (-(-n // m) for n, m in zip((height, width), tile.shape, strict=True))
+        return found[tile].repeat(1, rows, columns)[:, :height, :width]
     of_pattern = f", or {int(tile.max()) + 1} of the pattern {pattern!r}" if planes == 1 else ""
     raise ValueError(
         f"{name} has {len(found)} values for {planes} channels. Give one number for all, or {planes}{of_pattern}."

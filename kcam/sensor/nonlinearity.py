@@ -143,7 +143,7 @@ class Nonlinearity(Stage):
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Passes over the signal."""
-        return 8.0 + 2 * self.coefficients.numel()
+        return 5.0 + self.coefficients.numel()
 
     def reason(self, signal: Tensor, context: Context | None = None) -> str:
         """How far it is from a line."""
