@@ -227,6 +227,9 @@ class VeilingGlare(Stage):
     0.025
     """
 
+    whole_picture = True
+    """Light comes from anywhere in the picture: what a crop of it changes by tells little of the whole."""
+
     share: Scalar
     core: Scalar
     slope: Scalar

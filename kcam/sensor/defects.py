@@ -93,6 +93,9 @@ class DefectPixels(Stage):
     (True, 49)
     """
 
+    whole_picture = True
+    """It depends on which pixels there are: what a crop of a picture changes by tells little of the whole."""
+
     hot: float
     dead: float
     stuck: float

@@ -81,6 +81,9 @@ class MicrolensShading(Stage):
     (1.0, 0.32)
     """
 
+    whole_picture = True
+    """It depends on where in the picture a pixel is: what a crop of it changes by tells little of the whole."""
+
     acceptance: Tensor | float
     design_distance: Tensor | float | None
     pupil_distance: Tensor | float | None
