@@ -109,6 +109,11 @@ class ADC(Stage):
             check_positive(gain, name="gain", unit="(1 at base ISO)")
         hold(self, bits=bits, black_level=black_level, gain=gain, rounding=rounding, clamp_black=clamp_black)
 
+    def configuration(self) -> dict[str, Any]:
+        """Constructor arguments, for saving: a clamp only where there is one, so that older versions read the others."""
+        names = ("bits", "black_level", "gain", "rounding", *(("clamp_black",) if self.clamp_black else ()))
+        return {name: getattr(self, name) for name in names}
+
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) to the same shape: see `quantise`."""
         return quantise(
