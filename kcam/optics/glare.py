@@ -147,9 +147,9 @@ def _scattered(signal: Tensor, shares: Sequence[Tensor], transfers: Iterable[Ten
         if border == "mirror":
             for axis in (-2, -1):
                 around = torch.cat([around, around.flip(axis)], axis)
-        spectrum = torch.fft.rfft2(around, s=(2 * height, 2 * width)) * transfer.to(light.device)
+        spectrum = torch.fft.rfft2(around, s=(2 * height, 2 * width)) * transfer
         tail = torch.fft.irfft2(spectrum, s=(2 * height, 2 * width))[..., :height, :width]
-        planes.append(light + share.to(light.device) * (tail - light))
+        planes.append(light + share * (tail - light))
     return torch.stack(planes, -3).to(signal.dtype)
 
 
@@ -184,17 +184,20 @@ def veiling_glare(
         raise ValueError(f"unknown border {border!r}; known: {', '.join(GLARE_BORDERS)}.")
     if not signal.numel():
         return signal * 1.0
-    shares, cores = (_each(value, signal.shape[-3], name) for value, name in ((share, "share"), (core, "core")))
+    shares, cores = (
+        _each(value, signal.shape[-3], name=name).to(signal.device).unbind()
+        for value, name in ((share, "share"), (core, "core"))
+    )
     shape = (signal.shape[-2], signal.shape[-1])
     transfers = (glare_transfer(shape, core=one, slope=slope, reach=reach, border=border) for one in cores)
     return _scattered(signal, shares, transfers, border=border)
 
 
-def _each(value: Scalar, channels: int, name: str) -> tuple[Tensor, ...]:
+def _each(value: Scalar, channels: int, *, name: str) -> Tensor:
     values = float64(value).flatten()
     if len(values) not in (1, channels):
         raise ValueError(f"{name} has {len(values)} values for {channels} channels; give one number, or one for each.")
-    return values.expand(channels).unbind()
+    return values.expand(channels)
 
 
 class VeilingGlare(Stage):
@@ -271,7 +274,7 @@ class VeilingGlare(Stage):
         context = context or Context()
         if signal.ndim < 3 or not signal.numel():
             return veiling_glare(signal, share=self.share, core=self.core, slope=self.slope, reach=1.0)
-        shares, cores = self.scattering(signal.shape[-3], context)
+        shares, cores = (part.to(signal.device) for part in self.scattering(signal.shape[-3], context))
         reach = self._focal_length(context) / context.pixel_pitch
         height, width = signal.shape[-2:]
 
