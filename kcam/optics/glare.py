@@ -299,7 +299,7 @@ class VeilingGlare(Stage):
         context = context or Context()
         known: int | None = None
         if context.colour_filter is not None:
-            curves = context.colour_filter.contraction(context.wavelengths).detach().double().cpu()
+            curves = context.colour_filter.contraction(context.wavelengths).double()
             known = len(curves)
         grid = context.wavelengths.to(float64(self.share).device)
         shares = scattered_share(self.share, grid, reference=self.wavelength, power=self.power)
@@ -307,13 +307,13 @@ class VeilingGlare(Stage):
         if channels == known:
             light = context.illuminant
             light = spectral.illuminant("D65", wavelengths=context.wavelengths) if light is None else light
-            weights = (curves * light.detach().double().cpu()).to(grid)
+            weights = curves.to(grid) * light.to(grid)
             weights = weights / weights.sum(1, keepdim=True).clamp(min=1e-300)
-            scattered = weights * shares
+            scattered, seen = weights * shares, weights @ cores
             total = scattered.sum(1)
-            # of nothing that is scattered the mean is that of the light: finite, and with a slope
-            mean = (weights * cores).sum(1) if not float(total.detach().min()) > 0 else (scattered @ cores) / total
-            return total, mean
+            # where nothing is scattered the mean is that of the light, and of no light one that a slope needs
+            mean = torch.where(total > 0, (scattered @ cores) / torch.where(total > 0, total, 1.0), seen)
+            return total, torch.where(mean > 0, mean, float64(self.core))
         if channels == len(grid):
             return shares, cores
         if channels == 1 and known is not None:

@@ -110,7 +110,7 @@ class ADC(Stage):
         hold(self, bits=bits, black_level=black_level, gain=gain, rounding=rounding, clamp_black=clamp_black)
 
     def configuration(self) -> dict[str, Any]:
-        """Constructor arguments, for saving: a clamp only where there is one, so that older versions read the others."""
+        """Constructor arguments, for saving: a clamp only where there is one: older versions read the others."""
         names = ("bits", "black_level", "gain", "rounding", *(("clamp_black",) if self.clamp_black else ()))
         return {name: getattr(self, name) for name in names}
 

@@ -155,6 +155,6 @@ class DefectPixels(Stage):
 
     def reason(self, signal: Tensor, context: Context | None = None) -> str:
         """How many there are in a megapixel."""
-        found = [f"{share * 1e6:.3g} {name}" for name in ("hot", "dead", "stuck") if (share := getattr(self, name))]
+        found = [f"{share * 1e6:.6g} {name}" for name in ("hot", "dead", "stuck") if (share := getattr(self, name))]
         pixels = f"{', '.join(found) or 'no defect'} pixels per megapixel"
         return f"{pixels}, {self.error_if_skipped(signal, context):.1e} of the signal's RMS"

@@ -202,6 +202,35 @@ def test_the_stage_s_own_numbers_train(channels: int) -> None:
     assert torch.autograd.gradcheck(spread, given, eps=1e-7, atol=1e-5)
 
 
+def test_a_filter_that_trains_learns_what_its_light_scatters() -> None:
+    """Its curves decide which share of a channel's light is scattered too."""
+    grid = torch.linspace(430, 690, 5, dtype=torch.float64) * nm
+    bands, stage = Draw(5).noise(1, 5, 3, 4), optics.VeilingGlare(0.3, core=0.1, focal_length=4 * mm)
+
+    def hazy(coefficients: Tensor) -> Tensor:
+        own = sensor.ColourFilter.kodak()
+        del own.coefficients
+        own.coefficients = coefficients
+        return Camera(own, stage, context=Context(wavelengths=grid, pixel_pitch=100 * um))(bands)
+
+    coefficients = (0.1 + Draw(6).noise(3, 12)).requires_grad_()
+    assert torch.autograd.gradcheck(hazy, (coefficients,), atol=1e-6)
+    blind = torch.zeros(3, 12, dtype=torch.float64)
+    assert torch.equal(hazy(blind), torch.zeros(1, 3, 3, 4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-12])
+def test_without_scatter_there_is_a_slope_to_start_from(share: float) -> None:
+    own = nn.Parameter(torch.tensor(share, dtype=torch.float64))
+    context = Context(colour_filter=sensor.ColourFilter.kodak(), pixel_pitch=4 * um)
+    light = Draw(7).noise(1, 3, 6, 6)
+    hazy = optics.VeilingGlare(own, focal_length=8 * mm)(light, context)
+    torch.testing.assert_close(hazy.detach(), light, rtol=0, atol=1e-11)
+    hazy.square().sum().backward()
+    assert own.grad is not None
+    assert float(own.grad) < 0
+
+
 def test_a_parameter_trains_and_what_is_kept_is_renewed() -> None:
     share = nn.Parameter(torch.tensor(0.1))
     stage = optics.VeilingGlare(share, focal_length=8 * mm)

@@ -571,3 +571,16 @@ def test_a_measured_curve_becomes_a_stage() -> None:
 def test_errors(build, error: type[Exception], text: str) -> None:
     with pytest.raises(error, match=text):
         build()
+
+
+def test_a_clamp_is_saved_where_there_is_one(tmp_path: Path) -> None:
+    scene = Scene.from_rgb(torch.zeros(3, 8, 8))
+    for clamp in (False, True):
+        stages = [sensor.ReadNoise(50.0), sensor.ADC(bits=10, black_level=64, clamp_black=clamp)]
+        camera = Camera(sensor.ColourFilter.kodak(), sensor.Mosaic(), *stages)
+        camera.save(tmp_path / "camera.safetensors")
+        assert b"clamp_black" in (tmp_path / "camera.safetensors").read_bytes() or not clamp
+        again = Camera.load(tmp_path / "camera.safetensors")
+        assert again[-1].clamp_black is clamp
+        assert torch.equal(again(scene, generator=seeded()), camera(scene, generator=seeded()))
+        assert ("clamp_black=True" in str(again)) is clamp
