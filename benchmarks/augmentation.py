@@ -189,6 +189,41 @@ def pattern_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Ten
     return signal * gain + dsnu / augmentation.full_well * torch.randn_like(signal)
 
 
+def stripes_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """torch.randn twice, of all samples at once."""
+    row, column = (drawn[name].to(signal)[:, None, None, None] / augmentation.full_well for name in ("row", "column"))
+    batch, _, height, width = signal.shape
+    own = {"dtype": signal.dtype, "device": signal.device}
+    return signal + row * torch.randn(batch, 1, height, 1, **own) + column * torch.randn(batch, 1, 1, width, **own)
+
+
+def defects_of_the_batch(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """torch.rand and an exponential of all samples at once."""
+    hot, dead, electrons = (drawn[name].to(signal)[:, None, None, None] for name in ("hot", "dead", "electrons"))
+    kind, tail = torch.rand_like(signal), electrons / augmentation.full_well * torch.empty_like(signal).exponential_()
+    return torch.where(kind < dead, 0, signal + tail * (kind >= 1 - hot)).clamp(max=1)
+
+
+def glare_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """The mirrored picture and the tail at its pixels' centres, by FFT, for each channel of each sample."""
+    wavelengths, (height, width) = wavelengths_of(signal, augmentation.wavelengths) / 550e-9, signal.shape[-2:]
+    reach = augmentation.focal_length / augmentation.pixel_pitch
+    y, x = (torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64) for n in (height, width))
+    square = y[:, None] ** 2 + x**2
+    rows = []
+    for row, share, core, slope in zip(signal, drawn["share"], drawn["core"], drawn["slope"], strict=True):
+        channels = []
+        for plane, wavelength in zip(row.double(), wavelengths.tolist(), strict=True):
+            tail = (1 + square / (core * reach * wavelength) ** 2) ** (-slope / 2)
+            own = 1 - (1 - share) ** (wavelength**-2)
+            mirrored = torch.cat([plane, plane.flip(-1)], -1)
+            mirrored = torch.cat([mirrored, mirrored.flip(-2)], -2)
+            spread = torch.fft.irfft2(torch.fft.rfft2(mirrored) * torch.fft.rfft2(tail / tail.sum()))
+            channels.append((1 - own) * plane + own * spread[:height, :width])
+        rows.append(torch.stack(channels))
+    return torch.stack(rows).to(signal.dtype)
+
+
 def exposure_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
     """A gain and a clamp for each sample."""
     return torch.stack([(row * 2**stop).clamp(0, 1) for row, stop in zip(signal, drawn["stops"].tolist(), strict=True)])
@@ -301,12 +336,21 @@ CASES: dict[str, Case] = {
         vignette_per_sample,
         {"RandomLinearIllumination": lambda p: K.RandomLinearIllumination(p=p)},
     ),
+    "RandomVeilingGlare": Case(KC.RandomVeilingGlare, glare_per_sample, GAUSSIAN, exact=False),
     "RandomLensDistortion": Case(KC.RandomLensDistortion, distort_per_sample, {"RandomFisheye": fisheye}),
     "RandomLens": Case(KC.RandomLens, real_lens_per_sample, {}, share=1 / BATCH, only=(3,)),
     "RandomBayer": Case(KC.RandomBayer, bayer_per_sample, {"rgb_to_raw, raw_to_rgb": bayer}, relative_only=(3,)),
     "RandomShotReadNoise": Case(KC.RandomShotReadNoise, noise_of_the_batch, NOISE, exact=False),
     "RandomShotReadNoise, normal": Case(NORMAL_NOISE, normal_noise_of_the_batch, NOISE, exact=False),
     "RandomFixedPattern": Case(KC.RandomFixedPattern, pattern_of_the_batch, NOISE, exact=False),
+    "RandomBanding": Case(KC.RandomBanding, stripes_of_the_batch, NOISE, exact=False),
+    "RandomHotPixels": Case(
+        KC.RandomHotPixels,
+        defects_of_the_batch,
+        {"RandomSaltAndPepperNoise": lambda p: K.RandomSaltAndPepperNoise((0.001, 0.01), p=p)},
+        exact=False,
+        relative_only=(3,),
+    ),
     "RandomExposure": Case(
         KC.RandomExposure, exposure_per_sample, {"RandomBrightness": lambda p: K.RandomBrightness((0.5, 1.5), p=p)}
     ),

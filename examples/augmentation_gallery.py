@@ -45,6 +45,7 @@ def drawn_pipeline(seed: int) -> Callable[[Tensor], Tensor]:
 
 
 Strengths = dict[str, Callable[[], Any]]
+HOT = (0.001, 0.005, 0.02)
 GALLERY: dict[str, tuple[str, Strengths]] = {
     "RandomDefocus": (
         "50 mm f/2.8, focus 2 m; the picture at",
@@ -76,6 +77,10 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
         "field of view from corner to corner",
         {f"{a} degrees": lambda a=a: KC.RandomVignetting(field=float(a), shade=0.2, p=1.0) for a in (45, 70, 95)},
     ),
+    "RandomVeilingGlare": (
+        "light that the lens scatters, a share of",
+        {f"{v:.0%}": lambda v=v: KC.RandomVeilingGlare(share=v, slope=2.0, p=1.0) for v in (0.02, 0.1, 0.3)},
+    ),
     "RandomLensDistortion": (
         "barrel to pincushion, k1 =",
         {f"{k:g}": lambda k=k: KC.RandomLensDistortion(k1=k, p=1.0) for k in (-0.2, -0.1, 0.3)},
@@ -102,6 +107,14 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
     "RandomFixedPattern": (
         "spread of the pixels' gains, PRNU",
         {f"{v:.0%}": lambda v=v: KC.RandomFixedPattern(prnu=v, dsnu=20.0, p=1.0) for v in (0.03, 0.08, 0.15)},
+    ),
+    "RandomBanding": (
+        "rows and columns, a well of 10 000, electrons",
+        {f"{v}": lambda v=v: KC.RandomBanding(row=float(v), column=float(v), p=1.0) for v in (20, 80, 300)},
+    ),
+    "RandomHotPixels": (
+        "5000 electrons each, a share of the pixels of",
+        {f"{v:.1%}": lambda v=v: KC.RandomHotPixels(hot=v, dead=v / 2, electrons=5000.0, p=1.0) for v in HOT},
     ),
     "RandomExposure": (
         "stops; saturates at the full well",

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
-from kcam.context import Context
+from kcam.context import Context, Stage
 
 
 @dataclass(frozen=True)
@@ -57,3 +58,21 @@ class Skippable(Protocol):
 
     def reason(self, signal: Tensor, context: Context) -> str:
         """What decides, with its number: "sigma 3 electrons of 10 000"."""
+
+
+def relative_change(stage: Stage, signal: Tensor, context: Context | None = None) -> float:
+    """What a stage without noise changes of a signal: RMS of the change over the RMS of the signal, by computing it.
+
+    Args:      stage: keeps the shape of the signal.  signal: (B,C,H,W).  context: that the stage is told.
+
+    Example:
+    >>> from kcam.effects import relative_change
+    >>> round(relative_change(isp.Clip(), torch.tensor([[[[0.5, 1.1]]]])), 3)  # 0.1 of the root of 0.25 + 1.21
+    0.083
+    """
+    if not signal.numel():
+        return 0.0
+    with torch.no_grad():
+        change = stage(signal, context).double() - signal.double()
+        rms = signal.double().square().mean().sqrt().clamp(min=1e-12)
+        return float(change.square().mean().sqrt() / rms)

@@ -22,8 +22,8 @@ from kcam.scene import Scene
 from kcam.sensor.noise import like
 from kcam.threads import no_more_than_free
 
-LINEAR = (sensor.Transmission, sensor.ColourFilter, sensor.Mosaic, sensor.Exposure)
-NOISE = (sensor.ShotNoise, sensor.ReadNoise, sensor.FixedPattern, sensor.DarkCurrent)
+LINEAR = (sensor.Transmission, sensor.ColourFilter, sensor.Motion, sensor.Mosaic, sensor.Exposure)
+NOISE = (sensor.ShotNoise, sensor.ReadNoise, sensor.FixedPattern, sensor.DarkCurrent, sensor.RowColumnNoise)
 RECORDING = (*NOISE, isp.Clip, sensor.ADC)
 """What makes of each pixel's signal what is recorded: linear but for noise, limits and steps."""
 _ROUNDING = {torch.float64: 1e-9}  # of a stage of the user's that is taken for linear; else 1e-4

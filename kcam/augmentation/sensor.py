@@ -14,7 +14,18 @@ from kcam.cache import is_plain
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.isp import ColourMatrix, Demosaic, ToneCurve, WhiteBalance, demosaic
-from kcam.sensor import ColourFilter, Exposure, Mosaic, mosaic, quantise, read_noise, shot_noise
+from kcam.sensor import (
+    ColourFilter,
+    Exposure,
+    Mosaic,
+    defect_pixels,
+    fixed_stripes,
+    mosaic,
+    quantise,
+    read_noise,
+    row_column_noise,
+    shot_noise,
+)
 from kcam.sensor.noise import MOST_PRNU, fixed_pattern
 from kcam.ste import clip_ste
 from kcam.units import check_positive, wavelength_grid
@@ -209,6 +220,115 @@ class RandomFixedPattern(CameraAugmentation):
         for index, seed in enumerate(drawn["sensor_seed"].tolist()):
             row = slice(index, index + 1)
             rows.append(fixed_pattern(signal[row], prnu=prnu[row], dsnu=dsnu[row], full_well=self.full_well, seed=seed))
+        return torch.cat(rows)
+
+
+class RandomBanding(CameraAugmentation):
+    """Stripes of a sensor: offsets of its rows, new in each frame, and of its columns, which are the sensor's.
+
+    Rows as of `sensor.row_column_noise`, columns as of `sensor.fixed_stripes`; a new sensor for each sample. In
+    `K.VideoSequential` the frames of a clip share their columns, and each has its own rows.
+
+    Args:      row, column: sigma of the offsets [electrons].  full_well: [electrons].
+
+    Example:
+    >>> gray = torch.full((1, 3, 64, 64), 0.5)
+    >>> striped = KC.RandomBanding(row=20.0, column=0.0, p=1.0)(gray)
+    >>> bool((striped.std(-1) < 1e-6).all()), bool(striped.std(-2).min() > 0)  # even along rows, not across
+    (True, True)
+    """
+
+    alone = True
+
+    def __init__(
+        self,
+        row: Bounds = (0.0, 10.0),
+        column: Bounds = (0.0, 10.0),
+        *,
+        full_well: float = 10_000.0,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        check_positive(full_well, name="full_well", unit="electrons")
+        draws: dict[str, Draw] = {
+            "row": Uniform(row, least=0.0, unit="[electrons]"),
+            "column": Uniform(column, least=0.0, unit="[electrons]"),
+            "noise_seed": Seed(),
+            "sensor_seed": Seed(),
+        }
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        self.flags = {"full_well": full_well}
+        self.full_well = full_well
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Row by row, each from its own seeds."""
+        row, column = (per_sample(drawn[name], signal) for name in ("row", "column"))
+        generators = each_generator(drawn["noise_seed"], torch.device("cpu"))
+        rows, well = [], self.full_well
+        for index, (generator, seed) in enumerate(zip(generators, drawn["sensor_seed"].tolist(), strict=True)):
+            one = slice(index, index + 1)
+            striped = fixed_stripes(signal[one], row=0.0, column=column[one], full_well=well, seed=seed)
+            rows.append(row_column_noise(striped, row=row[one], column=0.0, full_well=well, generator=generator))
+        return torch.cat(rows)
+
+
+class RandomHotPixels(CameraAugmentation):
+    """Hot and dead pixels: `sensor.defect_pixels`, a new sensor for each sample, and the full well.
+
+    In `K.VideoSequential` the frames of a clip share their sensor. On a picture each channel has defects of its own, as
+    if it were a sensor; on a mosaic between plain stages they are those of its pixels.
+
+    Args:      hot: share of the pixels, 0 to 1, drawn uniformly in its logarithm: least 1e-9.
+               dead: share of the pixels, 0 to 1.
+               electrons: mean dark electrons of a hot pixel, drawn uniformly in its logarithm.
+               full_well: [electrons].
+    Raises:    ValueError for shares that are together more than 1, or other bounds that cannot be.
+
+    Example:
+    >>> gray = torch.full((1, 1, 100, 100), 0.5)
+    >>> shot = KC.RandomHotPixels(hot=0.01, dead=0.0, electrons=2000.0, p=1.0)(gray)
+    >>> int((shot > 0.5001).sum())  # about 100 of 10 000
+    102
+    """
+
+    alone = True
+
+    def __init__(
+        self,
+        hot: Bounds = (1e-5, 1e-3),
+        dead: Bounds = (0.0, 1e-4),
+        electrons: Bounds = (100.0, 3000.0),
+        *,
+        full_well: float = 10_000.0,
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        check_positive(full_well, name="full_well", unit="electrons")
+        draws: dict[str, Draw] = {
+            "hot": Uniform(hot, "log", least=1e-9, most=1.0, unit="(a share: 1e-4 is 100 per megapixel)"),
+            "dead": Uniform(dead, least=0.0, most=1.0, unit="(a share: 1e-4 is 100 per megapixel)"),
+            "electrons": Uniform(electrons, "log", least=1e-3, unit="[electrons]"),
+            "sensor_seed": Seed(),
+        }
+        super().__init__(draws, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        most = self.bounds("hot")[1] + self.bounds("dead")[1]
+        if most > 1 + 1e-6:
+            raise ValueError(f"hot and dead are up to {most:g} of the pixels together, more than all. 1e-4 is usual.")
+        self.flags = {"full_well": full_well}
+        self.full_well = full_well
+
+    def simulate(self, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """Row by row, each from its own seed."""
+        electrons, rows = per_sample(drawn["electrons"], signal), []
+        shares = zip(drawn["hot"].detach().tolist(), drawn["dead"].detach().tolist(), strict=True)
+        for index, ((hot, dead), seed) in enumerate(zip(shares, drawn["sensor_seed"].tolist(), strict=True)):
+            one = slice(index, index + 1)
+            shot = defect_pixels(
+                signal[one], hot=hot, dead=dead, electrons=electrons[one], full_well=self.full_well, seed=seed
+            )
+            rows.append(clip_ste(shot, None, 1.0))
         return torch.cat(rows)
 
 

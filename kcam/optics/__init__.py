@@ -19,6 +19,7 @@ from kcam.optics.elements import (
     ZernikeDOE,
 )
 from kcam.optics.elements.materials import GLASSES, Glass, refractive_index
+from kcam.optics.glare import VeilingGlare, scattered_share, scattered_within, veiling_glare
 from kcam.optics.imaging import Imaging
 from kcam.optics.lens import Lens
 from kcam.optics.measured import MeasuredPSF
@@ -47,9 +48,13 @@ __all__ = [
     "SquareAperture",
     "Surface",
     "ThinLens",
+    "VeilingGlare",
     "ZernikeAberration",
     "ZernikeDOE",
     "batch_psf",
     "refractive_index",
+    "scattered_share",
+    "scattered_within",
     "textbook",
+    "veiling_glare",
 ]

@@ -271,11 +271,16 @@ class Evaluator:
     # ---- the stages of the sensor --------------------------------------------------------------------------------
 
     def skippable(self) -> list[int]:
-        """Indices of the stages up to the ADC that say what leaving them out would cost, and may be."""
+        """Indices of the stages up to the ADC that say what leaving them out would cost, and may be.
+
+        One whose effect is of the whole picture (`whole_picture`) is kept where no trial sees that whole.
+        """
         found = []
+        crops = any(sample.places is not None for sample in self.witnesses)
         for index, stage in enumerate(self.camera):
             trained = any(p.requires_grad for p in stage.parameters())
-            if isinstance(stage, Skippable) and not trained and not isinstance(stage, Imaging):
+            unseen = crops and getattr(stage, "whole_picture", False)
+            if isinstance(stage, Skippable) and not (trained or unseen or isinstance(stage, Imaging)):
                 found.append(index)
             if isinstance(stage, ENDS):
                 break

@@ -22,18 +22,20 @@ def quantise(
     black_level: Tensor | float = 0.0,
     gain: Tensor | float = 1.0,
     rounding: bool = True,
+    clamp_black: bool = False,
 ) -> Tensor:
     """Convert a voltage to one of 2^bits numbers.
 
     y = round_ste( (2^bits - 1) clip_ste(gain signal + black_level / (2^bits - 1), 0, 1) ) / (2^bits - 1)
 
-    in this order: amplify, add the black level, clip, round. The gradient is `gain` inside the range, whatever the
-    rounding, and that of `clip_ste` outside.
+    in this order: amplify, add the black level, clip, round. With `clamp_black` what noise takes below the black level
+    is cut to it first, so that in the dark the mean of a noise sigma is sigma / sqrt(2 pi) above it. The gradient is
+    `gain` inside the range, whatever the rounding, and that of `clip_ste` outside.
 
     Args:      signal: any shape, 1.0 = full well.  bits: 1..24, the steps that float32 can hold; a tensor
                of whole numbers is broadcast against the signal.
                black_level: the number that no light gives [DN].  gain: analogue gain, 1 at base ISO.
-               rounding: False leaves the steps out.
+               rounding: False leaves the steps out.  clamp_black: of cameras that cut raw values off at black.
     Returns:   same shape, 1.0 = full scale (2^bits - 1 DN).
     Valid when the dtype holds the steps: float16 has 11 bits, bfloat16 8, and is given back with those.
 
@@ -43,6 +45,8 @@ def quantise(
     """
     top = 2**bits - 1 if isinstance(bits, int) else like(2 ** bits.long() - 1, signal)
     amplified = signal if _is(gain, 1.0) else signal * like(gain, signal)
+    if clamp_black:
+        amplified = clip_ste(amplified, 0.0, None)
     level = clip_ste(amplified if _is(black_level, 0.0) else amplified + like(black_level, signal) / top, 0.0, 1.0)
     if not rounding:
         return level
@@ -63,6 +67,9 @@ class ADC(Stage):
                gain: analogue gain, > 0; None to take it from the context (ISO / 100). The black level is added behind
                it, so that at a high gain it holds fewer electrons of read noise above 0.
                rounding: False leaves the steps out, as a `Plan` may.
+               clamp_black: whether values below the black level are cut to it, as cameras do that subtract it before
+               they write: a noise sigma then lifts the dark by sigma / sqrt(2 pi), which no later stage can tell from
+               light. A `Plan` never leaves it out.
     Raises:    TypeError for bits that are no integer; ValueError for a value out of range.
 
     Example:
@@ -75,6 +82,7 @@ class ADC(Stage):
     black_level: Tensor | float
     gain: Tensor | float | None
     rounding: bool
+    clamp_black: bool
 
     def __init__(
         self,
@@ -83,6 +91,7 @@ class ADC(Stage):
         black_level: Tensor | float = 0.0,
         gain: Tensor | float | None = None,
         rounding: bool = True,
+        clamp_black: bool = False,
     ):
         super().__init__()
         if isinstance(bits, bool) or not isinstance(bits, int):
@@ -98,12 +107,22 @@ class ADC(Stage):
             )
         if gain is not None:
             check_positive(gain, name="gain", unit="(1 at base ISO)")
-        hold(self, bits=bits, black_level=black_level, gain=gain, rounding=rounding)
+        hold(self, bits=bits, black_level=black_level, gain=gain, rounding=rounding, clamp_black=clamp_black)
+
+    def configuration(self) -> dict[str, Any]:
+        """Constructor arguments, for saving: a clamp only where there is one: older versions read the others."""
+        names = ("bits", "black_level", "gain", "rounding", *(("clamp_black",) if self.clamp_black else ()))
+        return {name: getattr(self, name) for name in names}
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) to the same shape: see `quantise`."""
         return quantise(
-            signal, bits=self.bits, black_level=self.black_level, gain=self._gain(context), rounding=self.rounding
+            signal,
+            bits=self.bits,
+            black_level=self.black_level,
+            gain=self._gain(context),
+            rounding=self.rounding,
+            clamp_black=self.clamp_black,
         )
 
     def _gain(self, context: Context | None) -> Tensor | float:
@@ -121,11 +140,18 @@ class ADC(Stage):
 
     def reason(self, signal: Tensor, context: Context | None = None) -> str:
         """The steps."""
-        return f"{2**self.bits - 1} steps, {self.error_if_skipped(signal, context):.1e} of the signal's RMS"
+        clamped = ", black clamped" if self.clamp_black else ""
+        return f"{2**self.bits - 1} steps, {self.error_if_skipped(signal, context):.1e} of the signal's RMS{clamped}"
 
     def bypass(self) -> ADC:
         """What stands in for it when it is left out: its gain, black level and limits, without the steps."""
-        return ADC(self.bits, black_level=self.black_level, gain=self.gain, rounding=False)
+        return ADC(
+            self.bits,
+            black_level=self.black_level,
+            gain=self.gain,
+            rounding=False,
+            clamp_black=self.clamp_black,
+        )
 
     def provides(self) -> dict[str, Any]:
         """The black level as a share of full scale, and the gain where it was given."""

@@ -55,6 +55,28 @@ def channel_masks(pattern: str, height: int, width: int, *, device: torch.device
     return one_hot.repeat(1, -(-height // rows), -(-width // columns))[:, :height, :width]
 
 
+def at_pixels(values: Tensor | float, signal: Tensor, *, pattern: str, name: str) -> Tensor:
+    """What belongs to a channel, at each pixel that records it: (C,1,1) of full planes, (1,H,W) of a mosaic.
+
+    Args:      values: a number for all, or one for each channel (C,).  signal: (..., C, H, W), or (..., 1, H, W) behind
+               a mosaic.  pattern: its name.  name: of the values, for the error.
+    Raises:    ValueError for another number of values.
+    """
+    dtype = values.dtype if isinstance(values, Tensor) else torch.float64
+    found = torch.as_tensor(values, dtype=dtype, device=signal.device).flatten()
+    planes, height, width = signal.shape[-3:]
+    if len(found) in (1, planes):
+        return found[:, None, None]
+    tile = pattern_tile(pattern).to(found.device)
+    if planes == 1 and len(found) == int(tile.max()) + 1:
+        rows, columns = (-(-n // m) for n, m in zip((height, width), tile.shape, strict=True))
+        return found[tile].repeat(1, rows, columns)[:, :height, :width]
+    of_pattern = f", or {int(tile.max()) + 1} of the pattern {pattern!r}" if planes == 1 else ""
+    raise ValueError(
+        f"{name} has {len(found)} values for {planes} channels. Give one number for all, or {planes}{of_pattern}."
+    )
+
+
 def mosaic(signal: Tensor, *, pattern: str) -> Tensor:
     """Keep at each pixel the one channel that the colour filter array lets through.
 

@@ -80,6 +80,12 @@ def check_full_well(value: Tensor | float | None) -> None:
             )
 
 
+def check_seed(seed: int) -> None:
+    """TypeError unless the seed that names a sensor is an integer."""
+    if isinstance(seed, bool) or not isinstance(seed, int):
+        raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
+
+
 def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Compute a function of a signal in at least float32 and give the result back in the signal's own dtype."""
 
@@ -593,8 +599,7 @@ class FixedPattern(RandomStage):
         percent = f"It is a share: did you mean {prnu} / 100?" if not isinstance(prnu, Tensor) else "It is a share."
         check_not_negative(prnu, name="prnu", unit="(relative gain)", most=MOST_PRNU, fix=percent)
         check_not_negative(dsnu, name="dsnu", unit="electrons", most=MOST_ELECTRONS)
-        if isinstance(seed, bool) or not isinstance(seed, int):
-            raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
+        check_seed(seed)
         check_full_well(full_well)
         hold(self, prnu=prnu, dsnu=dsnu, seed=seed, full_well=full_well)
 

@@ -137,6 +137,12 @@ CASES: tuple[Case, ...] = (
         geometric=True,
     ),
     Case("lens", shared_lens, fixed={"reach": (0.2, 0.4), "steps": 2}, geometric=True, slow=True),
+    Case(
+        "veiling_glare",
+        KC.RandomVeilingGlare,
+        {"share": (0.05, 0.1), "core": (0.002, 0.005), "slope": (1.6, 2.4)},
+        {"pixel_pitch": 10 * um},
+    ),
     Case("vignetting", KC.RandomVignetting, {"field": (40.0, 80.0), "shade": (0.1, 0.4)}),
     Case("bayer", KC.RandomBayer, cube_to_picture=True),
     Case("x_trans", KC.RandomBayer, fixed={"pattern": "x_trans"}, cube_to_picture=True),
@@ -148,6 +154,10 @@ CASES: tuple[Case, ...] = (
         rough=True,
     ),
     Case("fixed_pattern", KC.RandomFixedPattern, {"prnu": (0.01, 0.03), "dsnu": (20.0, 50.0)}, seeded=True),
+    Case("banding", KC.RandomBanding, {"row": (5.0, 15.0), "column": (5.0, 15.0)}, seeded=True),
+    Case(
+        "hot_pixels", KC.RandomHotPixels, {"electrons": (100.0, 200.0)}, {"hot": (0.05, 0.1), "dead": 0.02}, seeded=True
+    ),
     Case("exposure", KC.RandomExposure, {"stops": (-1.5, -0.5)}),
     Case("quantisation", KC.RandomQuantisation, fixed={"bits": (3, 6)}, rough=True),
     Case(
