@@ -212,6 +212,40 @@ class Camera(nn.Module):
         end = next((index for index, stage in enumerate(self) if isinstance(stage, DEVELOPING)), len(self))
         return self[:end](scene, generator=generator)
 
+    def burst(
+        self,
+        scene: Scene | Tensor,
+        *,
+        exposures: Sequence[float],
+        motion: sensor.Motion | None = None,
+        interval: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Take several pictures one after the other: a burst of equal exposures, or a bracket of unequal ones.
+
+        The still image is computed once, and the motion goes on from picture to picture. Each draws its noise from a
+        generator of its own, whose seed `generator` draws: picture k of two bursts has the same seed, whatever else
+        they are. What is fixed of the sensor is the same in all.
+
+        Args:      exposures: of each picture: seconds for a camera with ``Exposure(time=...)``, else times the camera's
+                   own automatic exposure, such as (0.25, 1, 4).
+                   motion: of a velocity, a translation or a flow, put before the mosaic. Its time is the exposure
+                   where that is in seconds, else its own. None: nothing moves.
+                   interval: from the end of one exposure, with its readout, to the start of the next [s].
+                   generator: source of all noise; None for torch's default one.
+        Returns:   (N,B,C,H,W): N pictures as `forward` gives them.
+        Raises:    ValueError for no exposures, or some that are not > 0, a camera without an Exposure, or with a Motion
+                   of its own beside `motion`, and a motion along a path, which has an end; TypeError for no Motion.
+
+        Example:
+        >>> bracket = Camera.phone().burst(Scene.builtin("coffee", size=32), exposures=[0.25, 1.0, 4.0])
+        >>> bracket.shape, bool(bracket[0].mean() < bracket[1].mean() < bracket[2].mean())
+        (torch.Size([3, 1, 3, 21, 32]), True)
+        """
+        from kcam.burst import burst
+
+        return burst(self, scene, exposures=exposures, motion=motion, interval=interval, generator=generator)
+
     def linear(self, scene: Scene) -> LinearCamera:
         """The linear part of the camera, from a scene's light to its raw signal, as an operator with its transpose.
 
@@ -412,9 +446,11 @@ def _check_order(stages: Sequence[nn.Module]) -> None:
         if isinstance(stage, glass) and any(isinstance(one, optics.Imaging) for one in behind):
             raise ValueError("Transmission stands before Imaging, which takes a scene. Move it behind Imaging.")
         if isinstance(stage, sensor.ColourFilter) and any(isinstance(one, glass) for one in behind):
-            raise ValueError(
-                "Transmission stands after ColourFilter, which leaves no bands. Move it before ColourFilter."
-            )
+            raise ValueError("Transmission stands after ColourFilter, which leaves no bands. Move it before it.")
+        mosaiced = isinstance(stage, sensor.Mosaic) or (isinstance(stage, sensor.ColourFilter) and stage.is_tile)
+        if mosaiced and any(isinstance(one, sensor.Motion) for one in behind):
+            name = type(stage).__name__
+            raise ValueError(f"Motion stands after {name}, where pixels have one colour each. Move it before {name}.")
 
 
 def _same_curves(told: Any, own: Any) -> bool:

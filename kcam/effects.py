@@ -39,7 +39,10 @@ class Skippable(Protocol):
     """A stage that a `Plan` may leave out: three methods. A stage without them is always kept.
 
     Left out means that the signal passes unchanged, or through the stage that its method ``bypass()`` gives. A stage
-    with a parameter that requires grad is kept whatever it says.
+    with a parameter that requires grad is kept whatever it says. One that has cheaper forms names them by a method
+    ``cheaper(signal, context)``: (what it is called, arguments of its method `changed`, its error), the cheapest first.
+    One whose effect depends on the place in the picture says so, ``whole_picture = True``, and ``only_whole = True`` if
+    it cannot be tried on a part of one.
 
     Example:
     >>> from kcam.effects import Skippable

@@ -27,7 +27,7 @@ LAYERS = [
     {"kcam.sensor"},
     {"kcam.isp"},
     {"kcam.camera"},
-    {"kcam.planner", "kcam.linear"},
+    {"kcam.planner", "kcam.linear", "kcam.burst"},
     {"kcam.augmentation", "kcam.data", "kcam.calibration"},
     {"kcam.style"},
     {"kcam.tradeoff"},
@@ -43,6 +43,7 @@ DATA = [{"cube"}, {"bands"}, {"readers", "patches"}, {"convert", "inspection", "
 METHODS = {
     ("kcam.camera", "kcam.planner"),
     ("kcam.camera", "kcam.linear"),
+    ("kcam.camera", "kcam.burst"),
     ("kcam.optics", "kcam.plots"),
     ("kcam.scene", "kcam.data"),
 }

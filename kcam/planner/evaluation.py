@@ -30,6 +30,7 @@ from kcam.planner.plan import (
     DEPTH,
     ENDS,
     OTHER_LIGHT,
+    Shortcuts,
     noiseless_raw,
     relative_rms,
     shares,
@@ -45,6 +46,7 @@ from kcam.sensor.noise import RandomStage
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
 WITNESSED = 2**20  # pixels of the last trial
+NOTHING: Shortcuts = {}
 HARDLY = 3e-3  # RMS of light that may be hidden, of what is recorded, that is taken for what it changes at most
 
 
@@ -99,6 +101,7 @@ class Evaluator:
         full = [scene for scene in scenes if scene.coefficients.numel()]
         self.surveys = [survey(scene, self.raw_camera, self.defocus) for scene in full]
         self.varies = self.imaging is not None and self.imaging.varies
+        self.whole = any(getattr(stage, "only_whole", False) for stage in stages)  # a map of the picture is of no crop
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
         self.scenes = full
         self.signals: list[dict[int, tuple[Tensor, Context]]] = []
@@ -108,12 +111,14 @@ class Evaluator:
     def samples(self) -> list[Sample]:
         """What choices are tried on."""
         # over the field a whole picture takes fewer PSFs than its crops: places mirror each other
+        if self.whole:
+            return self.witnesses
         return _samples(self.scenes, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
 
     @functools.cached_property
     def witnesses(self) -> list[Sample]:
         """What a finished plan is tried on."""
-        return _samples(self.scenes, self.surveys, pixels=WITNESSED)
+        return _samples(self.scenes, self.surveys, pixels=2**62 if self.whole else WITNESSED)
 
     def look(self, settings: Mapping[str, Any]) -> None:
         """See what the stages of the sensor are given, with about these optics, and whether spectra tell what choices
@@ -205,9 +210,9 @@ class Evaluator:
             off, all_of_it = energies[:, rows].sum(1).tolist()
             yield factor * self.lost[sample.owners[rows[0]]] * math.sqrt(off / all_of_it) if all_of_it else 0.0
 
-    def last(self, changes: Mapping[str, Any], skipped: Sequence[int]) -> float:
+    def last(self, changes: Mapping[str, Any], shortcuts: Shortcuts) -> float:
         """True error of a finished plan on all that it is for, or on the worst of it: the worst over the scenes."""
-        ours = [self._answer(sample, changes, skipped) for sample in self.witnesses]
+        ours = [self._answer(sample, changes, shortcuts) for sample in self.witnesses]
         return _error(self.witnesses, ours, self._references)
 
     @functools.cached_property
@@ -236,9 +241,9 @@ class Evaluator:
             self._answers[key] = [self._answer(sample, changes) for sample in self.samples]
         return self._answers[key]
 
-    def _answer(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Answer:
+    def _answer(self, sample: Sample, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Answer:
         with torch.set_grad_enabled(self.gradients):
-            raw = self._raw(sample, changes, skipped)
+            raw = self._raw(sample, changes, shortcuts)
             if not self.gradients or not raw.requires_grad:
                 return Answer(raw.detach(), tuple(torch.zeros_like(p) for p in self.parameters if self.gradients))
             with torch.no_grad():
@@ -248,9 +253,9 @@ class Evaluator:
         pairs = zip(found, self.parameters, strict=True)
         return Answer(raw.detach(), tuple(torch.zeros_like(p) if g is None else g for g, p in pairs))
 
-    def _raw(self, sample: Sample, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Tensor:
+    def _raw(self, sample: Sample, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Tensor:
         if sample.places is None or not (self.imaging and self.imaging.changed(**changes).varies):
-            return self._with(changes, skipped)(sample.scene)
+            return self._with(changes, shortcuts)(sample.scene)
         scene, reach, given = sample.scene, self.imaging.reach(sample.picture), self._always | dict(changes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         if depth.ndim > 1:  # layers lie where they lie in the whole
@@ -258,14 +263,14 @@ class Evaluator:
             given["layers"] = tuple((1 / own.vergences(scene, depth)).tolist())
         raws = []
         for row, place in enumerate(sample.places):
-            stages = self._with(given, skipped)
+            stages = self._with(given, shortcuts)
             parts = [s.part(place, reach=reach) if isinstance(s, Imaging) else s for s in stages]
             raws.append(Camera(*parts, context=stages.context)(scene.samples([row])))
         return torch.cat(raws)
 
-    def _with(self, changes: Mapping[str, Any], skipped: Sequence[int] = ()) -> Camera:
-        if skipped:
-            return noiseless_raw(shortened(self.camera, changes, skipped))
+    def _with(self, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Camera:
+        if shortcuts:
+            return noiseless_raw(shortened(self.camera, changes, shortcuts))
         return with_imaging(self.raw_camera, **changes)
 
     # ---- the stages of the sensor --------------------------------------------------------------------------------

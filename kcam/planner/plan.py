@@ -35,6 +35,9 @@ UNTRIED = 1.5
 """The same, of plans that no last trial has seen."""
 
 
+Shortcuts = Mapping[int, Mapping[str, Any] | None]
+"""Index of a stage -> the arguments of its `changed`, or None where it is left out."""
+
 GROWTH = 4.0
 """Times the error of the last trial, up to which a later scene's is foretold."""
 
@@ -189,7 +192,8 @@ class Plan:
     bound: sum of the counted errors, or what the last trial found if that is more; at most allowed / `SAFETY`, and
     allowed / `UNTRIED` where there was none.
     expected: root of the sum of their squares. checked: what the last trial found; None if there was none.
-    changes: arguments of the camera's Imaging. skipped: indices of the stages that are left out.
+    changes: arguments of the camera's Imaging. skipped: indices of the stages that are left out. replaced: by index,
+    the arguments of `changed` that make a stage's cheaper form.
     stages: classes of the camera's, by which it is known again. gradients: whether they were held to the tolerance, and
     trained: of which parameters; None where that was not kept.
     seconds, memory: predicted for the raw; reference_seconds, reference_memory: of the camera without the plan.
@@ -222,6 +226,12 @@ class Plan:
     measured: dict[str, float] = field(default_factory=dict)
     checked: float | None = None
     trained: tuple[str, ...] | None = None
+    replaced: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def shortcuts(self) -> Shortcuts:
+        """Stages that are left out, and those that are replaced."""
+        return dict.fromkeys(self.skipped) | {int(index): arguments for index, arguments in self.replaced.items()}
 
     def apply(self, camera: Camera) -> Camera:
         """The camera with only the chosen physics; it shares all parameters, and warns of scenes out of range.
@@ -234,9 +244,9 @@ class Plan:
                 f"the plan is for a camera of {', '.join(self.stages)}; this one has {', '.join(found) or 'no stages'}."
                 " Make another: camera.plan(scene, tolerance=...)."
             )
-        if not self.changes and not self.skipped:
+        if not self.changes and not self.shortcuts:
             return camera
-        stages = shortened(camera, self.changes, self.skipped)
+        stages = shortened(camera, self.changes, self.shortcuts)
         known = self.trained if self.gradients else ()
         ahead = set() if known is None else {*noiseless_raw(camera).parameters()}  # by identity
         unplanned = [p for name, p in camera.named_parameters() if p in ahead and name not in (known or ())]
@@ -467,14 +477,16 @@ def with_imaging(camera: Camera, **arguments: Any) -> Camera:
     return Camera(*stages, context=camera.context)
 
 
-def shortened(camera: Camera, changes: Mapping[str, Any], skipped: Sequence[int]) -> Camera:
-    """The camera with arguments of its Imaging changed, and without some stages; all else is shared."""
+def shortened(camera: Camera, changes: Mapping[str, Any], shortcuts: Shortcuts) -> Camera:
+    """The camera with its Imaging changed, without some stages or with cheaper forms of them; all else is shared."""
     stages: list[nn.Module] = []
     for index, stage in enumerate(camera):
         kept: Any = stage
         if isinstance(stage, Imaging) and changes:
             kept = stage.changed(**changes)
-        elif index in skipped:
+        elif (arguments := shortcuts.get(index)) is not None:
+            kept = kept.changed(**arguments)
+        elif index in shortcuts:
             bypass: Any = getattr(stage, "bypass", None)
             kept = bypass() if callable(bypass) else None
         if kept is not None:

@@ -95,7 +95,7 @@ def shoot(
     stages = list(camera)
     if planner.evaluator.index is not None and planner.evaluator.imaging is not None:
         stages[planner.evaluator.index] = planner.evaluator.imaging
-    short = shortened(Camera(*stages, context=camera.context), plan.changes, plan.skipped)
+    short = shortened(Camera(*stages, context=camera.context), plan.changes, plan.shortcuts)
     return short(scene, generator=generator), dataclasses.replace(plan, tolerance=tolerance)
 
 
@@ -142,7 +142,7 @@ class Planner:
         start = time.perf_counter()
         check_tolerance(tolerance)
         rows = _Rows(self.prices)
-        skipped: list[int] = []
+        shortcuts: dict[int, dict[str, Any] | None] = {}
         allowed, checked = 0.0, None
         if tolerance != 0 and self.evaluator.samples:
             ladders, skips = self._ways()
@@ -154,12 +154,12 @@ class Planner:
             for choice in movable:
                 choice.position = 0
             checked = self._settle(ladders, skips, allowed, noise if isinstance(tolerance, str) else None)
-            skipped = _skipped(skips, allowed, noise if isinstance(tolerance, str) else None)
+            shortcuts = _shortcuts(skips, allowed, noise if isinstance(tolerance, str) else None)
             for ladder in _relevant(ladders):
                 rows.add_ladder(ladder)
             rows.add_way()
             for skip in skips:
-                rows.add_skip(skip, left_out=skip.index in skipped)
+                rows.add_skip(skip, left_out=skip.index in shortcuts and shortcuts[skip.index] is None)
             rows.add_saturation(self.camera, self.evaluator.signals)
         rows.add_memory()
         errors = [row.error for row in rows.decisions if row.counted]
@@ -172,7 +172,8 @@ class Planner:
             checked=checked,
             decisions=tuple(rows.decisions),
             changes=rows.changes,
-            skipped=tuple(skipped),
+            skipped=tuple(sorted(index for index, arguments in shortcuts.items() if arguments is None)),
+            replaced={str(index): arguments for index, arguments in shortcuts.items() if arguments is not None},
             stages=tuple(type(stage).__name__ for stage in self.camera),
             range=Range.of(
                 self.scenes,
@@ -205,10 +206,10 @@ class Planner:
             if not below:
                 return 0.0
             changes = {key: value for ladder in _relevant(steps) for key, value in ladder.level.changes.items()}
-            skipped = tuple(_skipped(skips, allowed, noise))
-            key = tuple(sorted(changes.items())), skipped
+            shortcuts = _shortcuts(skips, allowed, noise)
+            key = tuple(sorted(changes.items())), repr(sorted(shortcuts.items()))
             if key not in self._checked:
-                self._checked[key] = self.evaluator.last(changes, skipped)
+                self._checked[key] = self.evaluator.last(changes, shortcuts)
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
             max(below, key=_urgency).climb(self.evaluator, allowed / SAFETY)
@@ -329,7 +330,7 @@ def _urgency(way: Ladder | _Skip) -> float:
 
 
 class _Skip:
-    """A stage that may be left out: a ladder of two rungs where its error counts."""
+    """A stage that may be left out, or take a cheaper form (`cheaper`): a ladder where its error counts."""
 
     def __init__(self, camera: Camera, index: int, signals: Signals) -> None:
         self.stage: Any = camera[index]
@@ -339,38 +340,44 @@ class _Skip:
         errors = [self.stage.error_if_skipped(*signal) for signal in found]
         worst = max(range(len(errors)), key=errors.__getitem__)
         self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst])
+        forms = getattr(self.stage, "cheaper", None)
+        self.forms = [("left out", None, self.error_if_skipped), *(forms(*found[worst]) if callable(forms) else ())]
         self.touched = self.stage.cost(*found[worst]) * max(signal.numel() for signal, _ in found)
 
     @property
     def error(self) -> float:
         """Estimated, as it is now."""
-        return 0.0 if self.position else self.error_if_skipped
+        return 0.0 if self.at_top else self.forms[self.position][2]
 
     @property
     def at_top(self) -> bool:
         """Whether it is kept."""
-        return self.position == 1
+        return self.position == len(self.forms)
 
     def price(self, evaluator: Evaluator) -> None:
         """It is known."""
 
     def climb(self, evaluator: Evaluator, most: float) -> None:
-        """Keep the stage."""
-        self.position = 1
+        """To the next form that does better, or the stage itself."""
+        before = self.error
+        self.position += 1
+        while self.error >= before and not self.at_top:
+            self.position += 1
 
 
-def _skipped(skips: Sequence[_Skip], allowed: float, noise: float | None) -> list[int]:
-    """Stages to leave out: those whose errors are in the sum, and noise and rounding that are small by themselves.
+def _shortcuts(skips: Sequence[_Skip], allowed: float, noise: float | None) -> dict[int, dict[str, Any] | None]:
+    """Stages to leave out or to replace: by those whose errors are in the sum; noise and rounding that are small by
+    themselves are left out.
 
     Together they stay below the tolerance; where the noise itself sets it, each source below a tenth of it.
     """
-    chosen = [skip.index for skip in skips if skip.counted and not skip.position]
+    chosen = {skip.index: skip.forms[skip.position][1] for skip in skips if skip.counted and not skip.at_top}
     together = 0.0
     for skip in sorted((skip for skip in skips if not skip.counted), key=lambda skip: skip.error):
         together = math.hypot(together, skip.error)
         if together <= (allowed if noise is None else NOISE_SHARE * noise):
-            chosen.append(skip.index)
-    return sorted(chosen)
+            chosen[skip.index] = None
+    return chosen
 
 
 class _Prices:
@@ -464,8 +471,10 @@ class _Rows:
     def add_skip(self, skip: _Skip, *, left_out: bool) -> None:
         """A stage of the sensor, or of the user's."""
         name = type(skip.stage).__name__
-        error = skip.error_if_skipped if left_out or not skip.counted else 0.0
-        chosen, instead = ("left out", "kept") if left_out else ("kept", "")
+        error = skip.error_if_skipped if left_out or not skip.counted else skip.error
+        replaced = skip.counted and not skip.at_top
+        form = skip.forms[skip.position][0] if replaced else "kept"
+        chosen, instead = ("left out", "kept") if left_out else (form, "kept" if replaced else "")
         saved = self.price.rates["touch"] * skip.touched
         why = f"{skip.reason}; saves {saved * 1e3:.2g} ms" if left_out else skip.reason
         self._add(name, chosen, instead, why, error, skip.counted)

@@ -104,6 +104,7 @@ class Exposure(Stage):
                iso: sensitivity, gain = iso / 100; None for the context's gain (1).
                quantum_efficiency: peak of green [electrons / photon], 0 < q <= 1; only used with `time`. None for the
                filter's own where it knows them (`ColourFilter.from_curves(..., quantum_efficiency=True)`), else 0.5.
+               compensation: times that exposure, > 0: 2 is a stop brighter; None for 1.
     Raises:    ValueError for a value out of range, and at the call for `time` without a lens in the context.
 
     Example:
@@ -116,6 +117,7 @@ class Exposure(Stage):
     time: Tensor | float | None
     iso: Tensor | float | None
     quantum_efficiency: Tensor | float | None
+    compensation: Tensor | float | None
 
     def __init__(
         self,
@@ -124,6 +126,7 @@ class Exposure(Stage):
         time: Tensor | float | None = None,
         iso: Tensor | float | None = None,
         quantum_efficiency: Tensor | float | None = None,
+        compensation: Tensor | float | None = None,
     ):
         super().__init__()
         for name, share in (("white_share", white_share), ("quantum_efficiency", quantum_efficiency)):
@@ -135,7 +138,15 @@ class Exposure(Stage):
             check_positive(time, name="time", unit="s")
         if iso is not None:
             check_positive(iso, name="iso", unit="(100 is base)")
+        if compensation is not None:
+            check_positive(compensation, name="compensation", unit="(1 is none)")
         hold(self, white_share=white_share, time=time, iso=iso, quantum_efficiency=quantum_efficiency)
+        hold(self, compensation=compensation)
+
+    def changed(self, **arguments: Any) -> Exposure:
+        """The same exposure with other arguments; it shares the rest."""
+        names = ("white_share", "time", "iso", "quantum_efficiency", "compensation")
+        return Exposure(**{name: getattr(self, name) for name in names} | arguments)
 
     def factor(self, context: Context | None = None) -> Tensor:
         """What the signal is multiplied by, as a 0-d float64 tensor (1.0 is the full well)."""
@@ -178,7 +189,8 @@ class Exposure(Stage):
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) relative irradiance to a share of the full well, not clipped."""
         check_signal(signal)
-        return signal * self.factor(context).to(signal)
+        factor = self.factor(context) if self.compensation is None else self.factor(context) * self.compensation
+        return signal * factor.to(signal)
 
     def provides(self) -> dict[str, Any]:
         """The gain, the exposure time and the white share, where they were given."""
