@@ -127,6 +127,19 @@ def test_the_neutral_is_what_a_white_gives_and_the_matrix_leads_there() -> None:
         assert abs(float(linear) - 1) < 1e-3
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_converter_by_the_specification_makes_the_same_picture(seed: int) -> None:
+    """XYZ under D50 = ForwardMatrix1 diag(1 / AsShotNeutral) camera, then adapted to D65: by colour-science."""
+    colour = pytest.importorskip("colour")
+    _, _, raw = taken(seed)
+    light = torch.rand(3, 100, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    d65 = torch.linalg.inv(spectral.xyz_to_srgb_matrix()).sum(1).numpy()
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries([0.9642, 1.0, 0.8249], d65, transform="Bradford")
+    xyz = adapt @ raw.forward_matrix.numpy() @ (light / raw.neutral[:, None]).numpy()
+    theirs = spectral.xyz_to_srgb_matrix().numpy() @ xyz
+    np.testing.assert_allclose(theirs, raw.camera_to_srgb @ (raw.gains[:, None] * light), atol=1e-6)
+
+
 def test_in_another_light_the_neutral_follows_and_the_matrix_s_white_stays_daylight_s() -> None:
     camera = camera_of()
     day, bulb = (scene_of(0, light=light) for light in ("D65", "A"))
@@ -193,6 +206,7 @@ def test_the_tags_of_a_dng_are_those_of_the_specification(tmp_path: Path) -> Non
     assert fractions(tags[50730])[0] == pytest.approx(raw.baseline_exposure, abs=1e-8)
     assert tags[51041] == pytest.approx(raw.noise_profile, rel=1e-12)
     assert tags[50708] == "Bench 3"
+    assert (tags[33434], tags[34855]) == ((1, 125), 400)
     assert tags[34665]["ExposureTime"] == (1, 125)
     assert tags[34665]["ISOSpeedRatings"] == 400
     codes = [struct.unpack_from("<H", path.read_bytes(), at)[0] for at in directory(path.read_bytes())]
@@ -317,7 +331,7 @@ def test_quad_bayer_comes_back_by_its_tags(tmp_path: Path) -> None:
 def test_a_monochrome_sensor_goes_out_and_comes_back(tmp_path: Path) -> None:
     kodak = sensor.ColourFilter.kodak()
     camera = Camera(
-        sensor.ColourFilter(kodak.coefficients[1:2], width=kodak.width), sensor.Exposure(), sensor.ADC(12, black_level=0),
+        sensor.ColourFilter(kodak.coefficients[1:2], width=kodak.width), sensor.Exposure(), sensor.ADC(12),
         isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve(),
     )  # fmt: skip
     scene = scene_of(1)
@@ -475,6 +489,8 @@ def test_what_no_raw_file_can_hold_is_refused(camera: Any, raw: Any, error: type
         ({"neutral": [0.5, 1.0]}, ValueError, "3 finite numbers"),
         ({"colour_matrix": torch.full((3, 3), math.nan)}, ValueError, "3 x 3 finite"),
         ({"exposure_time": 0.0}, ValueError, "exposure_time"),
+        ({"noise_profile": (1e-4, math.nan)}, ValueError, "noise_profile must be 2 finite numbers"),
+        ({"camera": None}, TypeError, "the camera's name"),
     ],
 )
 def test_fields_that_cannot_be_are_refused(changes: dict[str, Any], error: type[Exception], match: str) -> None:

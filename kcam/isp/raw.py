@@ -83,7 +83,7 @@ FORWARD_MATRIX, PROFILE_NAME, PROFILE_TONE_CURVE, DEFAULT_BLACK_RENDER, NOISE_PR
     51041,
 )
 PHOTOMETRIC, MAKE, MODEL, ORIENTATION, LINEAR_RAW = 262, 271, 272, 274, 34892
-SHORT, LONG, RATIONAL = 3, 4, 5
+SHORT, LONG, RATIONAL, SRATIONAL = 3, 4, 5, 10
 """Types of a tag's values."""
 D65_LIGHT, NO_BLACK_RENDER = 21, 1
 Tag = tuple[int, str, int, Any, bool]
@@ -94,7 +94,7 @@ class Raw:
     """What a sensor recorded, and what its picture needs: one picture, as it lies on the sensor (not turned).
 
     Fields:    mosaic: (1,1,H,W) [DN], float32 or float64, which hold 16 bits exactly; whole numbers become float32.
-               pattern: name in `kcam.sensor.PATTERNS`, its tile's corner on the picture's; None for a monochrome sensor.
+               pattern: name in `kcam.sensor.PATTERNS`, its tile's corner on the picture's; None for monochrome.
                black_level: the number of no light [DN]: one, or a tensor of one for each cell of the pattern's tile.
                white_level: the number of a full pixel, above 255 [DN].
                neutral: (3,) what a white gives in each channel in the light of the shot, 1 in green (DNG's
@@ -130,15 +130,16 @@ class Raw:
             ("mosaic", _checked_mosaic(self.mosaic)),
             ("white_level", _number(self.white_level, "white_level", "DN")),
             ("black_level", self._checked_black()),
-            ("neutral", _three(self.neutral, "neutral", (3,))),
-            ("colour_matrix", _three(self.colour_matrix, "colour_matrix", (3, 3))),
+            ("neutral", _finite(self.neutral, "neutral", (3,))),
+            ("colour_matrix", _finite(self.colour_matrix, "colour_matrix", (3, 3))),
+            ("noise_profile", _pair(self.noise_profile)),
             ("baseline_exposure", _number(self.baseline_exposure, "baseline_exposure", "EV")),
         ):
             object.__setattr__(self, name, value)
         if self.white_level <= EIGHT_BITS:
             raise ValueError(
-                f"white_level {self.white_level:g} is that of 8 bits or less, whose steps are coarser than the noise of "
-                "the shadows: 8 bits are refused for raw data. Record it with sensor.ADC(bits=12)."
+                f"white_level {self.white_level:g} is that of 8 bits or less, whose steps are coarser than the "
+                "noise of the shadows: 8 bits are refused for raw data. Record it with sensor.ADC(bits=12)."
             )
         if self.pattern not in (None, *COLOURED):
             white = " It has white pixels, for which raw files have no colours." if self.pattern in PATTERNS else ""
@@ -146,8 +147,8 @@ class Raw:
         black = torch.as_tensor(self.black_level)
         if black.ndim and tuple(black.shape) != self._tile_shape():
             raise ValueError(
-                f"black_level of shape {tuple(black.shape)} fits no {self.pattern or 'monochrome'} sensor: expected one "
-                f"number, or {self._tile_shape()}, one for each cell of the tile."
+                f"black_level of shape {tuple(black.shape)} fits no {self.pattern or 'monochrome'} sensor: expected "
+                f"one number, or {self._tile_shape()}, one for each cell of the tile."
             )
         low, high = float(black.min()), float(black.max())
         if not (low >= 0 and high < self.white_level):
@@ -157,6 +158,8 @@ class Raw:
             )
         if self.neutral is not None and not bool((self.neutral > 0).all()):
             raise ValueError(f"neutral must be above 0, such as [0.6, 1.0, 0.8], got {self.neutral.tolist()}.")
+        if not isinstance(self.camera, str):
+            raise TypeError(f"camera must be the camera's name, got {describe(self.camera)}.")
         for name, unit in (("exposure_time", "s"), ("iso", "(100 is base)")):
             if getattr(self, name) is not None:
                 check_positive(getattr(self, name), name=name, unit=unit)
@@ -267,8 +270,8 @@ class Raw:
         Args:      path: replaced if it exists.
         Raises:    ValueError for another suffix, a folder that does not exist, numbers outside 0..65535, and in a DNG
                    for a mosaic without neutral or colour matrix.
-        Valid when raw converters know the pattern: LibRaw has Bayer's four and x_trans, and pictures of 22 x 22 pixels
-                   and more; of quad_bayer a DNG says all, but few converters listen.
+        Valid when raw converters know the pattern: LibRaw has Bayer's four, and x_trans of 512 x 512 pixels and more;
+                   of quad_bayer a DNG says all, but few converters listen. LibRaw opens no less than 22 x 22 pixels.
 
         Example:
         >>> numbers = torch.randint(64, 1024, (1, 1, 24, 32))
@@ -283,8 +286,9 @@ class Raw:
         suffix = path.suffix.lower()
         if suffix not in SUFFIXES:
             raise ValueError(
-                f"cannot write {path.name}: raw data are 16 bits with their levels beside them, in {', '.join(SUFFIXES)}. "
-                f"Use {path.stem}.dng, or plots.write_picture(isp.develop(raw)[0], {path.name!r}) for a picture."
+                f"cannot write {path.name}: raw data are 16 bits with their levels beside them, in "
+                f"{', '.join(SUFFIXES)}. Use {path.stem}.dng, or, for a picture, "
+                f"plots.write_picture(isp.develop(raw)[0], {path.name!r})."
             )
         files.check_place(path)
         numbers = self.mosaic.detach().round()
@@ -338,6 +342,10 @@ class Raw:
             tags.append(_rational(COLOR_MATRIX, self.colour_matrix.flatten().tolist(), signed=True))
         if self.noise_profile is not None:
             tags.append((NOISE_PROFILE, "d", 2, self.noise_profile, True))
+        if self.exposure_time is not None:
+            tags.append(_rational(EXPOSURE_TIME, [self.exposure_time]))  # here by TIFF/EP; and again as EXIF
+        if self.iso is not None:
+            tags.append((ISO_SPEED, "H", 1, self._whole_iso(), True))
         return tags + (self._dng_tags() if dng else [])
 
     def _complete(self, file: io.BytesIO, *, linear_raw: bool) -> None:
@@ -359,9 +367,12 @@ class Raw:
             fraction = struct.pack("<2I", *_rational(EXPOSURE_TIME, [self.exposure_time])[3])
             entries.append(struct.pack("<HHII", EXPOSURE_TIME, RATIONAL, 1, end + 2 + 12 * count + 4))
         if self.iso is not None:
-            entries.append(struct.pack("<HHIHH", ISO_SPEED, SHORT, 1, min(MOST_DN, max(1, round(self.iso))), 0))
+            entries.append(struct.pack("<HHIHH", ISO_SPEED, SHORT, 1, self._whole_iso(), 0))
         file.seek(end)
         file.write(struct.pack("<H", count) + b"".join(entries) + bytes(4) + fraction)
+
+    def _whole_iso(self) -> int:
+        return min(MOST_DN, max(1, round(self.iso or 0)))
 
     def _level_tags(self) -> list[Tag]:
         black = torch.as_tensor(self.black_level, dtype=torch.float64)
@@ -404,7 +415,7 @@ class Raw:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Raw:
-        """Read a camera's raw file, ``.dng``, ``.nef``, ``.cr2``, ``.arw``, ... through LibRaw, or a ``.tif`` of `write`.
+        """Read a camera's raw file (.dng, .nef, .cr2, .arw, ...) through LibRaw, or a .tif of `write`.
 
         The visible part of the sensor; an X-Trans mosaic loses up to 5 rows and columns, so that it begins where the
         pattern does. What LibRaw does not say (baseline exposure, noise profile, name) is read from the tags.
@@ -446,7 +457,7 @@ def _linear(mosaic: Tensor, *, raw: Raw, method: str | None, domain: str) -> Ten
     signal = (mosaic - plane) / raw.white_level
     scale = 2**raw.baseline_exposure * raw.white_level / (raw.white_level - float(black.max()))
     if raw.pattern is None:
-        return apply_colour_matrix(signal, matrix=torch.full((3, 1), scale))
+        return apply_colour_matrix(signal, matrix=torch.full((3, 1), scale, dtype=torch.float64))
     planes = demosaic(signal, pattern=raw.pattern, method=method, domain=domain, gains=raw.gains)
     balanced = white_balance(planes, gains=raw.gains)
     return apply_colour_matrix(balanced, matrix=scale * raw.camera_to_srgb)
@@ -488,7 +499,7 @@ def _number(value: Any, name: str, unit: str) -> float:
     return float(number)
 
 
-def _three(value: Any, name: str, shape: tuple[int, ...]) -> Tensor | None:
+def _finite(value: Any, name: str, shape: tuple[int, ...]) -> Tensor | None:
     """None, or finite numbers of this shape, float64 on the CPU."""
     if value is None:
         return None
@@ -496,6 +507,11 @@ def _three(value: Any, name: str, shape: tuple[int, ...]) -> Tensor | None:
     if numbers.shape != shape or not bool(numbers.isfinite().all()):
         raise ValueError(f"{name} must be {' x '.join(map(str, shape))} finite numbers, got {numbers.tolist()}.")
     return numbers
+
+
+def _pair(value: Any) -> tuple[float, float] | None:
+    numbers = _finite(value, "noise_profile", (2,))
+    return None if numbers is None else (float(numbers[0]), float(numbers[1]))
 
 
 def _checked_mosaic(mosaic: Any) -> Tensor:
@@ -511,7 +527,7 @@ def _checked_mosaic(mosaic: Any) -> Tensor:
         raise ValueError(f"mosaic is of {mosaic.dtype}, which does not hold 16 bits. Use mosaic.float().")
     if mosaic.ndim != 4 or mosaic.shape[:2] != (1, 1) or mosaic.numel() == 0:
         raise ValueError(
-            f"mosaic has shape {tuple(mosaic.shape)}, expected (1,1,H,W): one plane of one picture, of at least a pixel."
+            f"mosaic has shape {tuple(mosaic.shape)}, expected (1,1,H,W): one plane of one picture, not empty."
         )
     mosaic = mosaic if mosaic.is_floating_point() else mosaic.float()
     low, high = (float(end) for end in mosaic.detach().aminmax())
@@ -541,8 +557,8 @@ def _check_signal(raw: Any) -> None:
     if not (low >= 0 and high <= 1):
         odd = "NaN" if math.isnan(low) else f"{low if low < 0 else high:g}"
         raise ValueError(
-            f"raw must be in 0..1, 1.0 = full scale, got {odd}. Use what camera.raw(scene) gives; numbers are divided by "
-            "2**bits - 1."
+            f"raw must be in 0..1, 1.0 = full scale, got {odd}. Use what camera.raw(scene) gives; numbers "
+            "are divided by 2**bits - 1."
         )
 
 
@@ -576,6 +592,10 @@ def _colours(camera: Camera, context: Context, *, mono: bool, share: float) -> d
     matrix = as_shot_colour_matrix(context, channels=channels) if matrix is None else matrix
     whole = (matrix.detach().double() * gains.detach().double().to(matrix.device)).cpu()  # channels to linear sRGB
     if mono:
+        if not float(whole.mean()) > 0:
+            raise ValueError(
+                f"the colour matrix makes {float(whole.mean()):g} of a white; expected more than 0, such as 1."
+            )
         return {"baseline_exposure": math.log2(float(whole.mean()) * share)}
     # What becomes gray: 1 / gains, if the matrix leaves white white.
     neutral, failed = torch.linalg.solve_ex(whole, torch.ones(3, dtype=torch.float64))
@@ -643,7 +663,7 @@ def _rational(code: int, values: Sequence[float], *, signed: bool = False) -> Ta
 
 
 def _reals(value: Any) -> list[float]:
-    """The numbers of a tag of fractions, whole numbers or floats, as tifffile gives it."""
+    """The numbers of a tag, one or many."""
     parts = list(value) if isinstance(value, (tuple, list)) else [value]
     return [float(part) for part in parts]
 
@@ -658,14 +678,14 @@ def _said_by_tags(tags: dict[int, Any]) -> dict[str, Any]:
     """Fields that tags of DNG hold, and LibRaw does not give of cameras that it does not know."""
     fields: dict[str, Any] = {}
     if BASELINE_EXPOSURE in tags:
-        fields["baseline_exposure"] = _divided(tags[BASELINE_EXPOSURE])[0]
+        fields["baseline_exposure"] = _reals(tags[BASELINE_EXPOSURE])[0]
     if NOISE_PROFILE in tags:
         pairs = _reals(tags[NOISE_PROFILE])  # one pair, or one per colour
         fields["noise_profile"] = tuple(float(np.mean(pairs[first::2])) for first in (0, 1))
     lights = {tags.get(CALIBRATION_ILLUMINANT + which): which for which in (0, 1) if COLOR_MATRIX + which in tags}
     if lights:  # that of daylight, else the second, which is the cooler light's
         which = lights.get(D65_LIGHT, max(lights.values()))
-        numbers = _divided(tags[COLOR_MATRIX + which])
+        numbers = _reals(tags[COLOR_MATRIX + which])
         if len(numbers) == 9:
             fields["colour_matrix"] = np.reshape(numbers, (3, 3))
     name = tags.get(UNIQUE_CAMERA_MODEL) or " ".join(str(tags[code]) for code in (MAKE, MODEL) if code in tags)
@@ -673,11 +693,11 @@ def _said_by_tags(tags: dict[int, Any]) -> dict[str, Any]:
 
 
 def _tags_of(page: Any) -> dict[int, Any]:
-    """Tags of a page and of the pages inside of it; the first that has one."""
+    """Tags of a page and of the pages inside of it, fractions as numbers; the first that has one."""
     found: dict[int, Any] = {}
     for each in (page, *(page.pages or ())):
         for tag in each.tags:
-            found.setdefault(tag.code, tag.value)
+            found.setdefault(tag.code, _divided(tag.value) if tag.dtype in (RATIONAL, SRATIONAL) else tag.value)
     return found
 
 
@@ -687,7 +707,7 @@ def _from_tiff(path: Path) -> dict[str, Any]:
 
     try:
         with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
+            page = file.pages.first
             words, tags = page.asarray(), _tags_of(page)
     except Exception as error:  # a damaged header makes tifffile raise anything
         raise ValueError(f"{path} is damaged, or no TIFF: {error}.") from error
@@ -703,19 +723,16 @@ def _from_tiff(path: Path) -> dict[str, Any]:
             f"tifffile.imread({path.name!r}))[None, None], pattern='RGGB', black_level=64, white_level=1023)."
         )
     rows, columns = tags.get(BLACK_LEVEL_REPEAT_DIM, (1, 1))
-    with tifffile.TiffFile(path) as file:
-        fractions = file.pages[0].tags[BLACK_LEVEL].dtype == RATIONAL
-    black = _divided(tags[BLACK_LEVEL]) if fractions else _reals(tags[BLACK_LEVEL])
     fields: dict[str, Any] = {
         "mosaic": torch.from_numpy(words.astype(np.float32))[None, None],
         "pattern": _named(tags[CFA_PATTERN], tags.get(CFA_REPEAT_PATTERN_DIM, (2, 2)), path)
         if CFA_PATTERN in tags
         else None,
-        "black_level": torch.tensor(black, dtype=torch.float64).reshape(rows, columns),
+        "black_level": np.reshape(_reals(tags[BLACK_LEVEL]), (rows, columns)),
         "white_level": _reals(tags[WHITE_LEVEL])[0],
     }
     if AS_SHOT_NEUTRAL in tags:
-        fields["neutral"] = _divided(tags[AS_SHOT_NEUTRAL])
+        fields["neutral"] = tags[AS_SHOT_NEUTRAL]
     exif = tags.get(EXIF, {})
     if "ExposureTime" in exif:
         fields["exposure_time"] = _divided(exif["ExposureTime"])[0]
@@ -744,7 +761,9 @@ def _from_libraw(path: Path) -> dict[str, Any]:
             return _fields_of(file, path, tags) | _said_by_tags(tags)
     except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
-        raise ValueError(f"{path} is damaged, or no raw file that LibRaw reads ({reason}).") from error
+        raise ValueError(
+            f"{path} is damaged, or no raw file that LibRaw reads, of 22 x 22 pixels at least: {reason}."
+        ) from error
 
 
 def _tags_in(path: Path) -> dict[int, Any]:
@@ -753,7 +772,7 @@ def _tags_in(path: Path) -> dict[int, Any]:
 
     try:
         with tifffile.TiffFile(path) as file:
-            return _tags_of(file.pages[0])
+            return _tags_of(file.pages.first)
     except Exception:
         return {}
 
