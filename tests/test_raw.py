@@ -488,6 +488,7 @@ def test_what_no_raw_file_can_hold_is_refused(camera: Any, raw: Any, error: type
         ({"neutral": [0.5, 0.0, 1.0]}, ValueError, "above 0"),
         ({"neutral": [0.5, 1.0]}, ValueError, "3 finite numbers"),
         ({"colour_matrix": torch.full((3, 3), math.nan)}, ValueError, "3 x 3 finite"),
+        ({"colour_matrix": torch.ones(3, 3)}, ValueError, "cannot be inverted"),
         ({"exposure_time": 0.0}, ValueError, "exposure_time"),
         ({"noise_profile": (1e-4, math.nan)}, ValueError, "noise_profile must be 2 finite numbers"),
         ({"camera": None}, TypeError, "the camera's name"),

@@ -50,8 +50,7 @@ if TYPE_CHECKING:
     from kcam.camera import Camera
     from kcam.scene import Scene
 
-WITH_TAGS = (".dng", ".tif", ".tiff")
-SUFFIXES = (*WITH_TAGS, ".npy")
+SUFFIXES = (".dng", ".tif", ".tiff", ".npy")
 """Of the files that are written."""
 COLOURED = tuple(name for name, tile in PATTERNS.items() if max(max(row) for row in tile) < 3)
 """Patterns of red, green and blue: DNG's colour tags have no room for white."""
@@ -69,19 +68,9 @@ CFA_REPEAT_PATTERN_DIM, CFA_PATTERN, EXPOSURE_TIME, EXIF, ISO_SPEED = 33421, 334
 DNG_VERSION, DNG_BACKWARD_VERSION, UNIQUE_CAMERA_MODEL = 50706, 50707, 50708
 CFA_PLANE_COLOR, CFA_LAYOUT, BLACK_LEVEL_REPEAT_DIM, BLACK_LEVEL, WHITE_LEVEL = 50710, 50711, 50713, 50714, 50717
 DEFAULT_CROP_ORIGIN, DEFAULT_CROP_SIZE, ACTIVE_AREA = 50719, 50720, 50829
-COLOR_MATRIX, AS_SHOT_NEUTRAL, BASELINE_EXPOSURE, CALIBRATION_ILLUMINANT = (
-    50721,
-    50728,
-    50730,
-    50778,
-)  # of the first light
-FORWARD_MATRIX, PROFILE_NAME, PROFILE_TONE_CURVE, DEFAULT_BLACK_RENDER, NOISE_PROFILE = (
-    50964,
-    50936,
-    50940,
-    51110,
-    51041,
-)
+COLOR_MATRIX, CALIBRATION_ILLUMINANT, FORWARD_MATRIX = 50721, 50778, 50964  # those of the first of two lights
+AS_SHOT_NEUTRAL, BASELINE_EXPOSURE, NOISE_PROFILE = 50728, 50730, 51041
+PROFILE_NAME, PROFILE_TONE_CURVE, DEFAULT_BLACK_RENDER = 50936, 50940, 51110
 PHOTOMETRIC, MAKE, MODEL, ORIENTATION, LINEAR_RAW = 262, 271, 272, 274, 34892
 SHORT, LONG, RATIONAL, SRATIONAL = 3, 4, 5, 10
 """Types of a tag's values."""
@@ -98,7 +87,7 @@ class Raw:
                black_level: the number of no light [DN]: one, or a tensor of one for each cell of the pattern's tile.
                white_level: the number of a full pixel, above 255 [DN].
                neutral: (3,) what a white gives in each channel in the light of the shot, 1 in green (DNG's
-               AsShotNeutral, 1 / gains); None where nothing is known, or monochrome.
+               AsShotNeutral, 1 / gains; brought there by its green); None where nothing is known, or monochrome.
                colour_matrix: (3,3) XYZ in daylight to the camera's channels (DNG's ColorMatrix1 for D65), or None.
                noise_profile: (S, O): the variance is S x + O of a signal x, black at 0 and white at 1, or None.
                baseline_exposure: by how much the developed picture is to be brighter than that x [EV].
@@ -156,8 +145,15 @@ class Raw:
                 f"black_level must be from 0 to below the white level of {self.white_level:g} DN, such as 64, got "
                 f"{low if not low >= 0 else high:g}."
             )
-        if self.neutral is not None and not bool((self.neutral > 0).all()):
-            raise ValueError(f"neutral must be above 0, such as [0.6, 1.0, 0.8], got {self.neutral.tolist()}.")
+        if self.neutral is not None:
+            if not bool((self.neutral > 0).all()):
+                raise ValueError(f"neutral must be above 0, such as [0.6, 1.0, 0.8], got {self.neutral.tolist()}.")
+            object.__setattr__(self, "neutral", self.neutral / self.neutral[1])
+        if self.colour_matrix is not None and not abs(torch.linalg.det(self.colour_matrix)) > 1e-9:
+            raise ValueError(
+                f"colour_matrix cannot be inverted: its determinant is {torch.linalg.det(self.colour_matrix):g}. "
+                "Expected three channels that differ, a determinant such as 0.5."
+            )
         if not isinstance(self.camera, str):
             raise TypeError(f"camera must be the camera's name, got {describe(self.camera)}.")
         for name, unit in (("exposure_time", "s"), ("iso", "(100 is base)")):
@@ -245,13 +241,13 @@ class Raw:
         pattern = _pattern_of(camera, context)
         top = 2**adc.bits - 1
         black = _number(adc.black_level, "black_level of the ADC", "DN")
-        steps = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        range_ = {"white_level": top, "pattern": pattern, "black_level": black}
-        signal = round_ste(steps * top) if adc.rounding else steps * top
+        numbers = top * (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw)
         exposure = next((stage.time for stage in camera if isinstance(stage, Exposure)), None)
         return cls(
-            mosaic=signal,
-            **range_,
+            mosaic=round_ste(numbers) if adc.rounding else numbers,
+            pattern=pattern,
+            black_level=black,
+            white_level=top,
             **_colours(camera, context, mono=pattern is None, share=(top - black) / top),
             noise_profile=_noise_profile(camera, context, adc, black=black, size=raw.shape[-2:]),
             exposure_time=None if exposure is None else float(exposure),
@@ -305,20 +301,10 @@ class Raw:
             if suffix == ".npy":
                 np.save(file, words)
             else:
-                place = (
-                    EXIF - 1,
-                    "I",
-                    1,
-                    0,
-                    True,
-                )  # tifffile does not write the directory of EXIF, nor its tag: see there
-                options: dict[str, Any] = {
-                    "photometric": "cfa" if cfa else "minisblack",
-                    "metadata": None,
-                    "software": False,
-                    "byteorder": "<",
-                }
-                tifffile.imwrite(file, words, extratags=[*tags, place], **options)
+                exif = (EXIF - 1, "I", 1, 0, True)  # tifffile refuses the tag of EXIF: one beside it keeps its place
+                light = "cfa" if cfa else "minisblack"
+                options: dict[str, Any] = {"metadata": None, "software": False, "byteorder": "<"}
+                tifffile.imwrite(file, words, photometric=light, extratags=[*tags, exif], **options)
                 self._complete(file, linear_raw=suffix == ".dng" and not cfa)
             files.replace(path, file.getvalue())
 
@@ -696,7 +682,7 @@ def _tags_of(page: Any) -> dict[int, Any]:
     """Tags of a page and of the pages inside of it, fractions as numbers; the first that has one."""
     found: dict[int, Any] = {}
     for each in (page, *(page.pages or ())):
-        for tag in each.tags:
+        for tag in getattr(each, "tags", ()):
             found.setdefault(tag.code, _divided(tag.value) if tag.dtype in (RATIONAL, SRATIONAL) else tag.value)
     return found
 
@@ -722,13 +708,11 @@ def _from_tiff(path: Path) -> dict[str, Any]:
             f"{path} is a picture without the tags {' and '.join(lacking)} of raw data. Use Raw(torch.from_numpy("
             f"tifffile.imread({path.name!r}))[None, None], pattern='RGGB', black_level=64, white_level=1023)."
         )
-    rows, columns = tags.get(BLACK_LEVEL_REPEAT_DIM, (1, 1))
+    tile = tuple(tags.get(CFA_REPEAT_PATTERN_DIM, (2, 2)))
     fields: dict[str, Any] = {
         "mosaic": torch.from_numpy(words.astype(np.float32))[None, None],
-        "pattern": _named(tags[CFA_PATTERN], tags.get(CFA_REPEAT_PATTERN_DIM, (2, 2)), path)
-        if CFA_PATTERN in tags
-        else None,
-        "black_level": np.reshape(_reals(tags[BLACK_LEVEL]), (rows, columns)),
+        "pattern": _named(tags[CFA_PATTERN], tile, path) if CFA_PATTERN in tags else None,
+        "black_level": np.reshape(_reals(tags[BLACK_LEVEL]), tags.get(BLACK_LEVEL_REPEAT_DIM, (1, 1))),
         "white_level": _reals(tags[WHITE_LEVEL])[0],
     }
     if AS_SHOT_NEUTRAL in tags:
@@ -743,7 +727,7 @@ def _from_tiff(path: Path) -> dict[str, Any]:
 
 def _named(cells: Any, shape: Sequence[int], path: Path) -> str:
     """The name of a pattern in CFA tags."""
-    tile = np.frombuffer(bytes(cells), dtype=np.uint8).reshape(tuple(shape)).tolist()
+    tile = _tile(cells, shape).tolist()
     for name in COLOURED:
         if [list(row) for row in PATTERNS[name]] == tile:
             return name
@@ -802,9 +786,7 @@ def _fields_of(file: Any, path: Path, tags: dict[int, Any]) -> dict[str, Any]:
     channels = np.array(["RGB".index(letter) for letter in letters])[cells]
     shape = tuple(tags.get(CFA_REPEAT_PATTERN_DIM, (2, 2)))
     if shape not in LIBRAWS and not any(tags.get(ACTIVE_AREA, (0,))[:2]):
-        cells = channels = _repeated(
-            np.frombuffer(bytes(tags[CFA_PATTERN]), dtype=np.uint8).reshape(shape), words.shape
-        )
+        cells = channels = _repeated(_tile(tags[CFA_PATTERN], shape), words.shape)
     name, top, left = _found(channels, path)
     words, cells = words[top:, left:], cells[top:, left:]
     rows, columns = len(PATTERNS[name]), len(PATTERNS[name][0])
@@ -819,6 +801,11 @@ def _fields_of(file: Any, path: Path, tags: dict[int, Any]) -> dict[str, Any]:
         "neutral": gains[1] / gains if (gains > 0).all() else None,
         "colour_matrix": matrix if matrix.any() else None,
     }
+
+
+def _tile(cells: Any, shape: Sequence[int]) -> np.ndarray:
+    """The tile in CFA tags."""
+    return np.frombuffer(bytes(cells), dtype=np.uint8).reshape(tuple(shape))
 
 
 def _repeated(tile: np.ndarray, size: tuple[int, int]) -> np.ndarray:
