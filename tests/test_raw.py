@@ -389,6 +389,33 @@ def test_a_foreign_dng_is_read_in_its_active_area(pattern: str, margins: tuple[i
     same(Raw.from_file(tmp_path / "again.dng"), raw, atol=1e-6)
 
 
+def test_a_dng_with_a_preview_first_is_read_below_it(tmp_path: Path) -> None:
+    """As Adobe's converter writes it: colours beside an 8-bit preview, mosaic and noise (per colour) in a SubIFD."""
+    pytest.importorskip("rawpy")
+    words = np.random.default_rng(0).integers(300, 16000, (64, 80)).astype(np.uint16)
+    matrix = (9, 10, -2, 10, -1, 10, -5, 10, 12, 10, 3, 10, -1, 10, 3, 10, 7, 10)
+    outer = [
+        (50706, "B", 4, bytes((1, 4, 0, 0)), True), (50708, "s", 8, b"Other X\0", True),
+        (50728, "2I", 3, (1, 2, 1, 1, 3, 4), True), (50778, "H", 1, 21, True), (50721, "2i", 9, matrix, True),
+        (50730, "2i", 1, (-1, 4), True),
+    ]  # fmt: skip
+    inner = [
+        (33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\1\2\0\1", True), (50714, "H", 1, 256, True),
+        (50717, "I", 1, 16000, True), (51041, "d", 6, (1e-4, 1e-7, 2e-4, 1e-7, 3e-4, 1e-7), True),
+    ]  # fmt: skip
+    preview = np.full((16, 20, 3), 90, np.uint8)
+    with tifffile.TiffWriter(tmp_path / "preview.dng") as file:
+        options: dict[str, Any] = {"metadata": None, "software": False}
+        file.write(preview, photometric="rgb", subifds=1, subfiletype=1, extratags=outer, **options)
+        file.write(words, photometric="cfa", subfiletype=0, extratags=inner, **options)
+    raw = Raw.from_file(tmp_path / "preview.dng")
+    assert (raw.pattern, raw.black_level, raw.white_level, raw.camera) == ("GBRG", 256, 16000, "Other X")
+    assert np.array_equal(raw.mosaic[0, 0].numpy(), words)
+    assert raw.baseline_exposure == -0.25
+    assert raw.noise_profile == pytest.approx((2e-4, 1e-7))
+    np.testing.assert_allclose(raw.colour_matrix, np.reshape(fractions(matrix), (3, 3)))
+
+
 def test_x_trans_begins_where_its_pattern_does(tmp_path: Path) -> None:
     pytest.importorskip("rawpy")
     raw = taken(4, pattern="x_trans")[2]
