@@ -3,8 +3,9 @@
 from kcam import isp, optics, sensor, units
 from kcam.camera import Camera
 from kcam.context import Context, Stage
+from kcam.isp.raw import Raw
 from kcam.planner import Plan
 from kcam.scene import Scene
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "Context", "Plan", "Scene", "Stage", "__version__", "isp", "optics", "sensor", "units"]
+__all__ = ["Camera", "Context", "Plan", "Raw", "Scene", "Stage", "__version__", "isp", "optics", "sensor", "units"]

@@ -2,140 +2,117 @@
 Raw files in and out
 ====================
 
-A raw signal of kcam goes into a 16-bit TIFF and comes back without loss, and a raw mosaic of any other camera is
-developed by kcam's stages once its black level, white level and colours are known. There is no DNG yet.
+A raw signal of kcam goes into a DNG that any raw converter opens, and the raw file of any camera is developed by kcam's
+own stages: ``kcam.Raw`` is both ways.
 """
 
 # %%
-# The raw signal
-# --------------
+# Out: a DNG
+# ----------
 #
-# ``camera.raw(scene)`` is what the sensor recorded: one plane, a mosaic, in which 1.0 is full scale. A file holds the
-# numbers themselves (DN), so we multiply by :math:`2^b - 1`.
+# ``camera.raw(scene)`` is what the sensor recorded: one plane, a mosaic, in which 1.0 is full scale.
+# ``Raw.from_camera`` makes of it what a raw file holds: whole numbers (DN), and beside them all that the picture needs,
+# from the camera's own stages: pattern, black and white level, what a white gives in each channel (the neutral), the
+# colour matrix and the noise.
 
+import dataclasses
 import tempfile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
-import tifffile
+import rawpy
 import torch
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from kcam import Camera, Scene, isp, optics, plots, sensor, spectral
+from kcam import Camera, Raw, Scene, isp, optics, plots, sensor, spectral
 from kcam.units import mm, nm, um
 
-bits, black_level = 12, 256
-full_scale = 2**bits - 1
 lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(8 * mm), focus_distance=2.0)
 camera = Camera(
     optics.Imaging(lens, pixel_pitch=3.45 * um),
     sensor.ColourFilter.kodak(infrared_cut=680 * nm), sensor.Mosaic("GRBG"), sensor.Exposure(),
-    sensor.ShotNoise(full_well=10_000), sensor.ReadNoise(2.4), sensor.ADC(bits, black_level=black_level),
+    sensor.ShotNoise(full_well=10_000), sensor.ReadNoise(2.4), sensor.ADC(bits=12, black_level=256),
     isp.Demosaic(), isp.WhiteBalance(), isp.ColourMatrix(), isp.ToneCurve(),
 )  # fmt: skip
 scene = Scene.builtin("astronaut", size=256)
-raw = camera.raw(scene, generator=torch.Generator().manual_seed(0))
-numbers = (raw[0, 0] * full_scale).round().to(torch.uint16).numpy()
-print(f"raw {tuple(raw.shape)}; numbers from {numbers.min()} to {numbers.max()}")
-
-# %%
-# Out: a TIFF of 16 bits
-# ----------------------
-#
-# What a reader has to know beside the numbers are the pattern, the black level and the white level. They have tags of
-# their own in a TIFF: the first two in this table are of TIFF/EP, the others of DNG.
-
-CFA_REPEAT, CFA_PATTERN, BLACK_LEVEL, WHITE_LEVEL = 33421, 33422, 50714, 50717
-
-
-def write_raw(path, numbers, *, pattern, black_level, white_level):
-    """A Bayer mosaic (H,W) of whole numbers as a TIFF whose tags say how to read it."""
-    colours = ["RGB".index(letter) for letter in pattern]
-    tags = [  # code, type, count, value, only once
-        (CFA_REPEAT, "H", 2, (2, 2), True),
-        (CFA_PATTERN, "B", 4, bytes(colours), True),
-        (BLACK_LEVEL, "H", 1, black_level, True),
-        (WHITE_LEVEL, "H", 1, white_level, True),
-    ]
-    tifffile.imwrite(path, numbers, photometric="CFA", extratags=tags)
-
-
-def read_raw(path):
-    """The mosaic (H,W), its pattern, black level and white level."""
-    with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
-        tag = {code: page.tags[code].value for code in (CFA_PATTERN, BLACK_LEVEL, WHITE_LEVEL)}
-        pattern = "".join("RGB"[colour] for colour in tag[CFA_PATTERN])
-        return page.asarray(), pattern, tag[BLACK_LEVEL], tag[WHITE_LEVEL]
-
+generator = torch.Generator().manual_seed(0)
+raw = Raw.from_camera(camera, camera.raw(scene, generator=generator))
+slope, offset = raw.noise_profile
+print(f"{raw.pattern}, black {raw.black_level:g}, white {raw.white_level:g}, gains {raw.gains.numpy().round(2)}")
+print(f"variance of a signal x in 0..1: {slope:.2e} x + {offset:.1e}")
 
 folder = tempfile.TemporaryDirectory()
-path = Path(folder.name) / "astronaut.tif"
-write_raw(path, numbers, pattern="GRBG", black_level=black_level, white_level=full_scale)
-again, pattern, black, white = read_raw(path)
-print(f"{path.name}: {again.shape}, {again.dtype}, {pattern}, black {black}, white {white}")
-assert np.array_equal(again, numbers)
+path = Path(folder.name) / "astronaut.dng"
+raw.write(path)  # .tif and .npy are the other suffixes
 
 # %%
-# In: developed by the camera's own stages
-# ----------------------------------------
+# A converter makes of it what kcam does
+# --------------------------------------
 #
-# A slice of a camera is a camera that still knows what the others said: ``camera[7:]``, from the demosaic on, knows the
-# pattern, the black level, the filter's curves and, in a ``Context``, the light. It makes of the file the very picture
-# that the camera makes of the scene.
+# LibRaw, which is inside many raw converters, reads the very numbers, and develops them with the file's white balance
+# and colours. What differs from kcam's picture is its demosaic. A white fills only 0.8 of full scale in this camera: by
+# how much the picture is to be brightened stands in the DNG's ``BaselineExposure``, which LibRaw leaves to the caller.
 
-signal = torch.from_numpy(again.astype(np.float32))[None, None] / full_scale
-developed = camera[7:](signal)
+with rawpy.imread(str(path)) as file:
+    theirs = file.postprocess(
+        use_camera_wb=True, no_auto_bright=True, adjust_maximum_thr=0.0, gamma=(2.4, 12.92), output_bps=16,
+        bright=2**raw.baseline_exposure * float(raw.gains.min()),
+    )  # fmt: skip
+
+again = Raw.from_file(path)
+developed = isp.develop(again)
 picture = camera(scene, generator=torch.Generator().manual_seed(0))
-print(f"largest difference to the camera's picture: {(developed - picture).abs().max():.0e}")
+print(f"largest difference of isp.develop to the camera's own picture: {(developed - picture).abs().max():.0e}")
+assert torch.equal(again.mosaic, raw.mosaic)
 assert torch.allclose(developed, picture, atol=1e-5)
 
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.3), layout="constrained")
 detail = slice(60, 92), slice(100, 132)
-axes[0].imshow(numbers, cmap="gray")
-axes[0].set_title("The numbers in the file")
-axes[1].imshow(plots.false_colour(signal[0], plots.mosaic_tile(camera))[detail])
-axes[1].set_title("32 x 32 of them, by filter")
+signal = raw.mosaic[0] / raw.white_level
+axes[0].imshow(plots.false_colour(signal, plots.mosaic_tile(camera))[detail])
+axes[0].set_title("32 x 32 of the numbers")
+axes[1].imshow(theirs / 65535)
+axes[1].set_title("The DNG, developed by LibRaw")
 axes[2].imshow(plots.as_image(developed[0]))
-axes[2].set_title("Developed from the file")
+axes[2].set_title("The DNG, developed by kcam")
 for ax in axes:
     ax.axis("off")
 
 # %%
-# A raw of another camera
-# -----------------------
+# In: a photograph
+# ----------------
 #
-# Of a camera that kcam did not simulate we have the numbers and the tags, but no curves of its filter. Here is one to
-# try: 14 bits, whose white level is *not* full scale, and with a filter that we pretend not to know. It photographed a
-# colour chart and a cup in the light of a bulb.
+# ``Raw.from_file("photo.nef")`` reads .dng, .nef, .cr2, .arw, ... through LibRaw (``pip install "kcam[raw]"``), and
+# ``isp.develop(raw)`` makes the picture. It is differentiable in ``raw.mosaic``, and its demosaic has a name:
+# ``isp.develop(raw, method="menon")``.
+#
+# A camera whose colours nobody knows
+# -----------------------------------
+#
+# Of a camera on a bench we may have the numbers and the levels, but neither neutral nor colours. Here is one to try: 14
+# bits, whose white level is *not* full scale, and with a filter that we pretend not to know. It photographed a colour
+# chart and a cup in the light of a bulb.
 
 unknown = Camera(
     camera[0], sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB"), sensor.Exposure(),
     sensor.ShotNoise(full_well=20_000), sensor.ReadNoise(3.0),
 )  # fmt: skip
-unknown_black, unknown_white = 512, 15_300
 generator = torch.Generator().manual_seed(1)
+found = {}
 for name in ("colour_chart", "coffee"):
-    light = unknown(Scene.builtin(name, size=240, illuminant="A"), generator=generator)[0, 0]
-    recorded = (unknown_black + light.clamp(max=1) * (unknown_white - unknown_black)).round().to(torch.uint16).numpy()
-    write_raw(Path(folder.name) / f"{name}.tif", recorded, pattern="RGGB", black_level=512, white_level=15_300)
-
-
-def read_signal(name):
-    """A file as a signal (1,1,H,W) with black at 0 and white at 1, and its pattern."""
-    numbers, pattern, black, white = read_raw(Path(folder.name) / f"{name}.tif")
-    numbers = torch.from_numpy(numbers.astype(np.float32))[None, None]
-    return (numbers - black) / (white - black), pattern
-
+    light = unknown(Scene.builtin(name, size=240, illuminant="A"), generator=generator)
+    numbers = (512 + light.clamp(max=1) * (15_300 - 512)).round()
+    Raw(numbers, pattern="RGGB", black_level=512, white_level=15_300).write(Path(folder.name) / f"{name}.tif")
+    found[name] = Raw.from_file(Path(folder.name) / f"{name}.tif")
 
 # %%
-# Black level and white level are gone now, so the stages are told of none. White balance and colour matrix follow from
-# the chart: the gains make its brightest patch, a gray, gray, and ``isp.fit_colour_matrix`` finds the matrix that takes
-# the 24 patches closest to their colours in daylight.
+# Both follow from the chart: the neutral is what its brightest patch, a gray, gives in each channel, and
+# ``isp.fit_colour_matrix`` finds the matrix that takes the 24 patches closest to their colours in daylight. A raw file
+# holds the way back, from XYZ to the camera.
 
-chart, pattern = read_signal("colour_chart")
-planes = isp.Demosaic(pattern=pattern)(chart)[0]
+chart = found["colour_chart"]
+signal = (chart.mosaic - chart.black_level) / (chart.white_level - chart.black_level)
+planes = isp.Demosaic(pattern=chart.pattern)(signal)[0]
 side = 40  # pixels of a patch; the outer 10 are left out
 patches = planes.unfold(1, side, side).unfold(2, side, side)[..., 10:30, 10:30].mean((-2, -1))  # (3, 4, 6)
 patches = patches.flatten(1).T.double()  # (24, 3), row by row
@@ -143,14 +120,16 @@ patches = patches.flatten(1).T.double()  # (24, 3), row by row
 daylight = Scene.builtin("colour_chart", size=(4, 6))  # a pixel for each patch
 colours = spectral.xyz_to_linear_srgb(daylight.xyz())[0].flatten(1).T.double()
 brightest = 18  # "white 9.5 (.05 D)", the first of the last row
-gains = patches[brightest, 1] / patches[brightest]
+neutral = patches[brightest] / patches[brightest, 1]
 white = patches[brightest, 1] / colours[brightest, 1]  # what a perfect white would have
-matrix = isp.fit_colour_matrix(patches * gains / white, colours=colours) / white
-develop = Camera(
-    isp.Demosaic(pattern=pattern, gains=gains), isp.WhiteBalance(gains), isp.ColourMatrix(matrix), isp.ToneCurve()
-)
-print("gains of red, green, blue:", [f"{gain:.2f}" for gain in gains.tolist()])
-print(develop)
+to_srgb = isp.fit_colour_matrix(patches / neutral / white, colours=colours)
+known = {
+    "neutral": neutral,
+    "colour_matrix": torch.linalg.inv(to_srgb) @ spectral.xyz_to_srgb_matrix(),
+    "baseline_exposure": -float(white.log2()),
+}
+chart, cup = (dataclasses.replace(found[name], **known) for name in ("colour_chart", "coffee"))
+print("gains of red, green, blue:", [f"{gain:.2f}" for gain in chart.gains.tolist()])
 
 
 def lab(linear):
@@ -158,18 +137,17 @@ def lab(linear):
     return rgb2lab(isp.tone_curve(linear.T[:, :, None])[..., 0].T.numpy())
 
 
-found = (patches * gains) @ matrix.T
-difference = deltaE_ciede2000(lab(found), lab(colours))
+difference = deltaE_ciede2000(lab((patches / neutral / white) @ to_srgb.T), lab(colours))
 print(f"CIEDE2000 of the 24 patches: mean {difference.mean():.1f}, largest {difference.max():.1f}")
 assert difference.mean() < 4
 
-cup, _ = read_signal("coffee")
-with torch.no_grad():
-    shown = {
-        "The cup before white balance": isp.ToneCurve()(isp.Demosaic(pattern=pattern)(cup)),
-        "The chart, developed": develop(chart),
-        "The cup, developed": develop(cup),
-    }
+shown = {
+    "The cup before white balance": isp.develop(
+        dataclasses.replace(cup, neutral=torch.ones(3), colour_matrix=spectral.xyz_to_srgb_matrix())
+    ),
+    "The chart, developed": isp.develop(chart),
+    "The cup, developed": isp.develop(cup),
+}
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.5), layout="constrained")
 for ax, (title, image) in zip(axes, shown.items(), strict=True):
     ax.imshow(plots.as_image(image[0]))
@@ -178,24 +156,13 @@ for ax, (title, image) in zip(axes, shown.items(), strict=True):
 folder.cleanup()
 
 # %%
-# A photograph's own gray card will do for the gains, where there is no chart: ``gains = green / mean of each channel``
-# over the card. In a scene without either, take the gains that the camera wrote into its file.
+# A photograph's own gray card will do for the neutral, where there is no chart. In a scene without either, take the
+# neutral of another shot in the same light.
 #
-# What is not there yet
-# ---------------------
+# What is left to others
+# ----------------------
 #
-# - **DNG.** kcam neither reads nor writes it. The file above has two of DNG's tags and is none: raw converters also ask
-#   for the DNG version, a colour matrix and the neutral of the shot. To read DNG, CR3, NEF or ARW use ``rawpy`` and
-#   go on as above:
-#
-#   .. code-block:: python
-#
-#       with rawpy.imread("photo.dng") as file:
-#           numbers = torch.from_numpy(file.raw_image_visible.astype("float32"))[None, None]
-#           black, white = file.black_level_per_channel[0], file.white_level
-#           gains = torch.tensor(file.camera_whitebalance[:3]) / file.camera_whitebalance[1]
-#
-#   ``rawpy`` is not part of kcam, and nothing here was tested with it.
-# - **Compression, lens corrections and defective pixels** of a manufacturer's file are not kcam's.
-# - ``plots.write_picture(raw[0], "raw.tif")`` writes 16 bits too, but as a picture: full scale becomes 65 535, and
-#   there are no tags.
+# - **Turning, lens corrections, defective pixels and compression**: a ``Raw`` lies as it lay on the sensor, without the
+#   corrections that a manufacturer's file may ask for, and is written without compression.
+# - ``plots.write_picture(raw.mosaic[0] / raw.white_level, "raw.tif")`` writes 16 bits too, but as a picture: full scale
+#   becomes 65 535, and there are no tags.

@@ -22,6 +22,7 @@ from kcam.isp.demosaic import (
     demosaic,
     learned_demosaic,
 )
+from kcam.isp.raw import develop
 from kcam.isp.style_stage import StyleStage
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "as_shot_gains",
     "convolve_planes",
     "demosaic",
+    "develop",
     "fit_colour_matrix",
     "learned_demosaic",
     "render_tones",
