@@ -150,6 +150,33 @@ def distort_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tenso
     return torch.cat(rows)
 
 
+def move_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """The transfer function of a straight line, of each mirrored sample."""
+    height, width = signal.shape[-2:]
+    fy, fx = torch.fft.fftfreq(2 * height)[:, None], torch.fft.rfftfreq(2 * width)
+    rows = []
+    for row, length, angle in zip(signal, drawn["length"], torch.deg2rad(drawn["angle"]), strict=True):
+        mirrored = torch.cat([row, row.flip(-1)], -1)
+        mirrored = torch.cat([mirrored, mirrored.flip(-2)], -2)
+        transfer = torch.sinc(length * (fx * angle.cos() + fy * angle.sin()))
+        rows.append(torch.fft.irfft2(torch.fft.rfft2(mirrored) * transfer, s=mirrored.shape[-2:]))
+    return torch.stack(rows)[..., :height, :width]
+
+
+def roll_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    """Each row from where it was, by Kornia's remap."""
+    height, width = signal.shape[-2:]
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    away, rows = y - (height - 1) / 2, []
+    for index in range(len(signal)):
+        own = {name: float(values[index]) for name, values in drawn.items()}
+        wave = torch.sin(2 * torch.pi * (own["cycles"] * y / height + own["phase"]))
+        across = x - own["lean"] * away - own["wobble"] * height * wave
+        maps = (across[None].to(signal), (y - own["stretch"] * away)[None].to(signal))
+        rows.append(remap(signal[index : index + 1], *maps, align_corners=True))
+    return torch.cat(rows)
+
+
 def bayer_per_sample(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
     """A mosaic and a demosaic for each sample; for a cube a camera."""
     rows = []
@@ -337,6 +364,10 @@ CASES: dict[str, Case] = {
         {"RandomLinearIllumination": lambda p: K.RandomLinearIllumination(p=p)},
     ),
     "RandomVeilingGlare": Case(KC.RandomVeilingGlare, glare_per_sample, GAUSSIAN, exact=False),
+    "RandomMotion": Case(KC.RandomMotion, move_per_sample, MOTION, exact=False),
+    "RandomRollingShutter": Case(
+        KC.RandomRollingShutter, roll_per_sample, {"RandomThinPlateSpline": lambda p: K.RandomThinPlateSpline(p=p)}
+    ),
     "RandomLensDistortion": Case(KC.RandomLensDistortion, distort_per_sample, {"RandomFisheye": fisheye}),
     "RandomLens": Case(KC.RandomLens, real_lens_per_sample, {}, share=1 / BATCH, only=(3,)),
     "RandomBayer": Case(KC.RandomBayer, bayer_per_sample, {"rgb_to_raw, raw_to_rgb": bayer}, relative_only=(3,)),

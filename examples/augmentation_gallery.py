@@ -108,6 +108,14 @@ GALLERY: dict[str, tuple[str, Strengths]] = {
         "spread of the pixels' gains, PRNU",
         {f"{v:.0%}": lambda v=v: KC.RandomFixedPattern(prnu=v, dsnu=20.0, p=1.0) for v in (0.03, 0.08, 0.15)},
     ),
+    "RandomMotion": (
+        "pixels, at 30 degrees",
+        {f"{v}": lambda v=v: KC.RandomMotion(length=float(v), angle=30.0, p=1.0) for v in (4, 10, 24)},
+    ),
+    "RandomRollingShutter": (
+        "lean, of the height",
+        {f"{v:g}": lambda v=v: KC.RandomRollingShutter(v, 0.0, 0.01, phase=0.0, p=1.0) for v in (0.05, 0.15, 0.3)},
+    ),
     "RandomBanding": (
         "rows and columns, a well of 10 000, electrons",
         {f"{v}": lambda v=v: KC.RandomBanding(row=float(v), column=float(v), p=1.0) for v in (20, 80, 300)},

@@ -220,6 +220,8 @@ AUGMENTATIONS: dict[str, Door] = {
         "RandomBayer": KC.RandomBayer(),
         "RandomShotReadNoise": KC.RandomShotReadNoise(p=1.0),
         "RandomFixedPattern": KC.RandomFixedPattern(p=1.0),
+        "RandomMotion": KC.RandomMotion(p=1.0),
+        "RandomRollingShutter": KC.RandomRollingShutter(p=1.0),
         "RandomBanding": KC.RandomBanding(p=1.0),
         "RandomHotPixels": KC.RandomHotPixels(p=1.0),
         "RandomVeilingGlare": KC.RandomVeilingGlare(p=1.0),

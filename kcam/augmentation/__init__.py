@@ -6,6 +6,7 @@ from kcam.augmentation.corruptions import CORRUPTIONS, Corruption, corrupt
 from kcam.augmentation.geometry import RandomLensDistortion
 from kcam.augmentation.isp import RandomColourMatrix, RandomToneCurve, RandomWhiteBalance
 from kcam.augmentation.lens import RandomLens
+from kcam.augmentation.motion import RandomMotion, RandomRollingShutter
 from kcam.augmentation.optics import (
     RandomAberration,
     RandomChromaticAberration,
@@ -44,7 +45,9 @@ __all__ = [
     "RandomHotPixels",
     "RandomLens",
     "RandomLensDistortion",
+    "RandomMotion",
     "RandomQuantisation",
+    "RandomRollingShutter",
     "RandomShotReadNoise",
     "RandomToneCurve",
     "RandomVeilingGlare",

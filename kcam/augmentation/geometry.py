@@ -111,7 +111,48 @@ class MovedPixels(Checked, K.GeometricAugmentationBase2D):
         return output
 
 
-class RandomLensDistortion(MovedPixels):
+class SmoothlyMoved(MovedPixels):
+    """Base of those for which a subclass says in `_through` where any points go, smoothly; it draws by Draws."""
+
+    takes_alpha = True
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
+        drawn = {name: params[name] for name in self._param_generator.draws}
+        return on_drawn_rows(
+            input, params, drawn, lambda rows, own: self._remapped(rows, own, flags, inverse=False), p=self.p
+        )
+
+    def _moved(self, points: Tensor, params: dict[str, Tensor], *, inverse: bool) -> Tensor:
+        """Points (B, ..., 2) in pixels to where the lens images them, or from there."""
+        if points.numel() == 0:
+            return points
+        height, width = params["forward_input_shape"][-2:].tolist()
+        flat = points.double().flatten(1, -2)
+        return self._through(flat, params, (height, width), inverse=inverse).view(points.shape)
+
+    def _through(self, points: Tensor, params: dict[str, Tensor], shape: tuple[int, int], *, inverse: bool) -> Tensor:
+        """Points (B,N,2) float64 of a picture of that shape to where they are imaged, or from there."""
+        raise NotImplementedError(f"{type(self).__name__} does not say where points go.")
+
+    def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:
+        if input.numel() == 0:
+            return input
+        working = input if input.dtype in (torch.float32, torch.float64) else input.float()
+        shape = working.shape[-2], working.shape[-1]
+
+        def move(points: Tensor) -> Tensor:
+            return self._through(points.expand(len(working), -1, -1), params, shape, inverse=not inverse)
+
+        with full_precision(working.device):
+            across, down = _moved_pixels(shape, move, working).unbind(1)
+            mode = Resample.get(flags.get("resample", Resample.BILINEAR)).name.lower()
+            return remap(working, across, down, mode=mode, align_corners=True).to(input.dtype)
+
+
+class RandomLensDistortion(SmoothlyMoved):
     """Barrel and pincushion distortion: the Brown-Conrady model, with OpenCV's coefficients.
 
     x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),   y_d = y (1 + ...) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -132,8 +173,6 @@ class RandomLensDistortion(MovedPixels):
     >>> float(warped[32, 32]), float(warped[0, 0])  # the corners move in, and leave black
     (1.0, 0.0)
     """
-
-    takes_alpha = True
 
     def __init__(
         self,
@@ -180,15 +219,6 @@ class RandomLensDistortion(MovedPixels):
                 )
         return drawn
 
-    def apply_transform(
-        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
-    ) -> Tensor:
-        """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
-        drawn = {name: params[name] for name in self._param_generator.draws}
-        return on_drawn_rows(
-            input, params, drawn, lambda rows, own: self._remapped(rows, own, flags, inverse=False), p=self.p
-        )
-
     def _lens(self, params: dict[str, Tensor], shape: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
         """Camera matrices (B,3,3) and coefficients (B,4), float64."""
         height, width = shape
@@ -199,34 +229,12 @@ class RandomLensDistortion(MovedPixels):
         )
         return camera.to(device).expand(len(coefficients), 3, 3), coefficients
 
-    def _moved(self, points: Tensor, params: dict[str, Tensor], *, inverse: bool) -> Tensor:
-        """Points (B, ..., 2) in pixels to where the lens images them, or from there."""
-        if points.numel() == 0:
-            return points
-        height, width = params["forward_input_shape"][-2:].tolist()
-        flat = points.double().flatten(1, -2)
-        return self._through(flat, params, (height, width), inverse=inverse).view(points.shape)
-
     def _through(self, points: Tensor, params: dict[str, Tensor], shape: tuple[int, int], *, inverse: bool) -> Tensor:
         """Points (B,N,2) float64 of a picture of that shape."""
         camera, coefficients = self._lens(params, shape, points.device)
         if inverse:
             return undistort_points(points, camera, coefficients, num_iters=_ITERATIONS)
         return distort_points(points, camera, coefficients)
-
-    def _remapped(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], *, inverse: bool) -> Tensor:
-        if input.numel() == 0:
-            return input
-        working = input if input.dtype in (torch.float32, torch.float64) else input.float()
-        shape = working.shape[-2], working.shape[-1]
-
-        def move(points: Tensor) -> Tensor:
-            return self._through(points.expand(len(working), -1, -1), params, shape, inverse=not inverse)
-
-        with full_precision(working.device):
-            across, down = _moved_pixels(shape, move, working).unbind(1)
-            mode = Resample.get(flags.get("resample", Resample.BILINEAR)).name.lower()
-            return remap(working, across, down, mode=mode, align_corners=True).to(input.dtype)
 
 
 def _moved_pixels(shape: tuple[int, int], move: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:

@@ -136,6 +136,20 @@ CASES: tuple[Case, ...] = (
         {"k1": (-0.2, -0.1), "k2": (0.01, 0.05), "p1": (0.001, 0.01), "p2": (0.001, 0.01)},
         geometric=True,
     ),
+    Case(
+        "rolling_shutter",
+        KC.RandomRollingShutter,
+        {
+            "lean": (0.05, 0.1),
+            "stretch": (0.01, 0.05),
+            "wobble": (0.01, 0.02),
+            "cycles": (1.0, 1.5),
+            "phase": (0.1, 0.2),
+        },
+        geometric=True,
+    ),
+    Case("motion", KC.RandomMotion, {"length": (3.0, 5.0), "angle": (20.0, 40.0)}),
+    Case("tremor", KC.RandomMotion, {"length": (3.0, 5.0), "angle": (20.0, 40.0)}, {"kind": "tremor"}, seeded=True),
     Case("lens", shared_lens, fixed={"reach": (0.2, 0.4), "steps": 2}, geometric=True, slow=True),
     Case(
         "veiling_glare",
