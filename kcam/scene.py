@@ -113,7 +113,7 @@ class Scene:
         *,
         depth: float | Tensor = 2.0,
         wavelengths: Tensor | None = None,
-        illuminant: str | Tensor = "D65",
+        illuminant: str | Tensor | spectral.SpectralTable = "D65",
         luminance: float = 1000.0,
     ) -> Scene:
         """A scene whose reflectance has the colours of an sRGB picture: white paint is 1, and the light falls on it.
@@ -150,7 +150,7 @@ class Scene:
         *,
         wavelengths: Tensor | None = None,
         depth: float | Tensor = 2.0,
-        illuminant: str | Tensor = "D65",
+        illuminant: str | Tensor | spectral.SpectralTable = "D65",
         luminance: float = 1000.0,
     ) -> Scene:
         """A scene from a measured cube of spectral radiance.
@@ -179,7 +179,7 @@ class Scene:
         *,
         depth: float | Tensor = 2.0,
         wavelengths: Tensor | None = None,
-        illuminant: str | Tensor = "D65",
+        illuminant: str | Tensor | spectral.SpectralTable = "D65",
         luminance: float = 1000.0,
     ) -> Scene:
         """A scene from a photograph, taken as sRGB; see `read_picture` and `from_rgb`."""
@@ -196,7 +196,7 @@ class Scene:
         depth_scale: float = 1e-3,
         size: int | tuple[int, int] | None = None,
         wavelengths: Tensor | None = None,
-        illuminant: str | Tensor = "D65",
+        illuminant: str | Tensor | spectral.SpectralTable = "D65",
         luminance: float = 1000.0,
     ) -> Scene:
         """The photographs of a folder, with their depth maps, as one batch (B,H,W) in natural order of their names.
@@ -251,7 +251,7 @@ class Scene:
         size: int | tuple[int, int] | None = None,
         *,
         wavelengths: Tensor | None = None,
-        illuminant: str | Tensor = "D65",
+        illuminant: str | Tensor | spectral.SpectralTable = "D65",
         luminance: float = 1000.0,
     ) -> Scene:
         """A scene that needs no file and no network, at 2 m, in float32.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from kcam import files, optics, plots
+from kcam import files, optics, plots, sensor
 from kcam.camera import Camera
 from kcam.data.photos import PICTURES, files_in
 from kcam.planner import Plan
@@ -82,7 +82,8 @@ def shoot(
             check_not_too_near(stage, distance, shape=(scene.shape[1], scene.shape[2]))
     with torch.no_grad():
         picture, plan = within(camera, scene, tolerance=tolerance, generator=torch.Generator().manual_seed(seed))
-    if picture.shape[1] not in (1, 3):
+    grey = picture.shape[1] == 1 and not any(isinstance(stage, sensor.Mosaic) for stage in camera)
+    if picture.shape[1] != 3 and not grey:
         raise ValueError(f"the camera gives {picture.shape[1]} channels, not a picture. Let it demosaic.")
     target.parent.mkdir(exist_ok=True)
     plots.write_picture(picture[0].clamp(0, 1), target)

@@ -115,6 +115,7 @@ class SmoothlyMoved(MovedPixels):
     """Base of those for which a subclass says in `_through` where any points go, smoothly; it draws by Draws."""
 
     takes_alpha = True
+    _param_generator: Draws
 
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
@@ -195,7 +196,7 @@ class RandomLensDistortion(SmoothlyMoved):
             raise ValueError(f"focal_length must be > 0 of the picture's longer side, got {focal_length:g}.")
         values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
         draws = {name: Uniform(bounds, least=-10.0, most=10.0) for name, bounds in values.items()}
-        self._param_generator: Draws = Draws(draws)
+        self._param_generator = Draws(draws)
         self.flags = {"resample": Resample.get(resample), "align_corners": True, "focal_length": focal_length}
         self.focal_length = focal_length
 

@@ -117,7 +117,7 @@ class RandomRollingShutter(SmoothlyMoved):
             "cycles": Uniform(cycles, least=0.0, most=100.0),
             "phase": Uniform(phase, least=-1.0, most=1.0),
         }
-        self._param_generator: Draws = Draws(draws)
+        self._param_generator = Draws(draws)
         self.flags = {"resample": Resample.get(resample), "align_corners": True}
 
     def _through(self, points: Tensor, params: dict[str, Tensor], shape: tuple[int, int], *, inverse: bool) -> Tensor:

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from commands import run
 from draws import Draw
+from PIL import Image
 from torch import Tensor, nn
 
-from kcam import Camera, Scene, isp, optics, sensor, spectral
+from kcam import Camera, Scene, isp, optics, plots, sensor, spectral
 from kcam.context import Context
 from kcam.sensor import ColourFilter, Transmission
 from kcam.units import mm, nm, um
@@ -207,6 +209,13 @@ class TestMonochrome:
             Camera.load(tmp_path / "mono.safetensors")(scene, generator=next(seeded)),
             toned(scene, generator=next(seeded)),
         )
+
+    def test_the_command_takes_grey_pictures_with_it(self, tmp_path: Path) -> None:
+        Camera(*self.camera(), isp.ToneCurve()).save(tmp_path / "mono.safetensors")
+        plots.write_picture(torch.rand(3, 40, 60), tmp_path / "photo.png")
+        run("shoot", tmp_path / "photo.png", "--camera", tmp_path / "mono.safetensors", "--out", tmp_path / "grey.png")
+        with Image.open(tmp_path / "grey.png") as picture:
+            assert (picture.mode, picture.size) == ("L", (60, 40))
 
     def test_near_infrared_counts(self) -> None:
         bands = torch.linspace(400, 1000, 13).double() * nm

@@ -305,7 +305,7 @@ class TestBurst:
         found = linear.burst(scene, exposures=[0.5, 1.0, 2.0])
         torch.testing.assert_close(found[2], 2 * found[1])
         torch.testing.assert_close(found[0], found[1] / 2)
-        timed = [*camera][:3] + [sensor.Exposure(time=0.01)]
+        timed = [*[*camera][:3], sensor.Exposure(time=0.01)]
         seconds = Camera(*timed).burst(scene, exposures=[0.01, 0.04])
         torch.testing.assert_close(seconds[0], Camera(*timed)(scene))
         torch.testing.assert_close(seconds[1], 4 * seconds[0])
