@@ -28,7 +28,7 @@ LAYERS = [
     {"kcam.isp"},
     {"kcam.camera"},
     {"kcam.planner", "kcam.linear", "kcam.burst"},
-    {"kcam.augmentation", "kcam.data", "kcam.calibration"},
+    {"kcam.augmentation", "kcam.data"},
     {"kcam.style"},
     {"kcam.tradeoff"},
     {"kcam.plots"},

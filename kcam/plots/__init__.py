@@ -23,7 +23,6 @@ from kcam.plots.psf import (
     psf_image,
     reach_of,
 )
-from kcam.plots.sensor import linearity_figure, transfer_figure, uniformity_figure
 from kcam.plots.sheet import (
     FAINT,
     FIGURE_SUFFIXES,
@@ -48,9 +47,8 @@ __all__ = [
     "CHANNEL_COLOURS", "CURVE_COLOURS", "FAINT", "FIGURE_SUFFIXES", "INK", "KNOB_COLOURS", "LABEL", "MUTED",
     "PICTURE_SUFFIXES", "SHARE_SHOWN", "SMALL", "TITLE", "Sheet", "Step", "as_image", "centre", "check_writable",
     "compare", "contact_sheet", "distance_colours", "duration", "false_colour", "field_figure", "figure_bytes",
-    "lens_figure", "lens_text", "light_colours", "linearity_figure", "metres", "mosaic_tile", "opd_figure",
+    "lens_figure", "lens_text", "light_colours", "metres", "mosaic_tile", "opd_figure",
     "optics_text", "percent_or_more", "pipeline", "pipeline_figure", "psf_figure", "psf_image", "quiet", "reach_of",
     "save_figure",
-    "section_figure", "shortened", "spot_figure", "steps", "tradeoff_figure", "transfer_figure",
-    "uniformity_figure", "write_picture",
+    "section_figure", "shortened", "spot_figure", "steps", "tradeoff_figure", "write_picture",
 ]  # fmt: skip
