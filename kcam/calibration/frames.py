@@ -48,7 +48,9 @@ def read_frame(path: str | os.PathLike[str]) -> np.ndarray:
 def check_kind(frame: np.ndarray, name: str) -> None:
     """ValueError unless it is one plane of numbers, of more than 8 bits."""
     if frame.ndim != 2 or 0 in frame.shape:
-        raise ValueError(f"{name} has shape {frame.shape}, expected one plane (H,W) of raw numbers, not yet demosaiced.")
+        raise ValueError(
+            f"{name} has shape {frame.shape}, expected one plane (H,W) of raw numbers, not yet demosaiced."
+        )
     if frame.dtype.kind not in "uif":
         raise ValueError(f"{name} holds {frame.dtype}, expected whole numbers such as uint16.")
     if frame.dtype.itemsize == 1:
@@ -217,7 +219,9 @@ def pairs(
     else:
         missing = [path.name for path in paths if path.name not in times]
         if missing:
-            raise ValueError(f"the table of times has no line for {missing[0]} (of {len(missing)}): add {missing[0]},0.01.")
+            raise ValueError(
+                f"the table of times has no line for {missing[0]} (of {len(missing)}): add {missing[0]},0.01."
+            )
         known = {path: times[path.name] for path in paths}
     ordered = sorted(paths, key=lambda path: (known.get(path, 0.0), natural(path)))
     made = list(zip(ordered[::2], ordered[1::2], strict=True))

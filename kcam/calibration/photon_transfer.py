@@ -45,6 +45,8 @@ UNITS = {
     "linearity_error": "fraction",
 }
 """What is measured of each channel, and its unit."""
+_WIDER = 1.05
+"""Standard errors are told so much wider than they are computed, since they are estimates themselves."""
 _ORDER = 4
 """Of the polynomial in x and y that stands for uneven light: the falloff of a lens is one."""
 _CUT = 0.005
@@ -246,10 +248,14 @@ def unrounded(variance: float) -> float:
     return low
 
 
-def _hidden(temporal: float, spread: float) -> tuple[float, float]:
-    """What rounding may shift a mean [DN] and a variance [DN^2] by, where most pixels lie at one place between steps."""
-    share = math.exp(-2 * math.pi**2 * max(temporal + spread, 0.0))
-    return 0.289 * share, (1 / math.pi**2 + 4 * max(temporal, 0.0)) / math.sqrt(2) * share
+def _hidden(variance: float, total: float) -> float:
+    """How far rounding may move a variance [DN^2], where most pixels lie at one place between two steps: its spread.
+
+    The first term of the Fourier series over that place m, (1/pi^2 + 4 s) exp(-2 pi^2 total) cos(2 pi m).
+
+    Args:      variance: of what is rounded, s.  total: the same with what spreads the pixels over the steps.
+    """
+    return (1 / math.pi**2 + 4 * max(variance, 0.0)) / math.sqrt(2) * math.exp(-2 * math.pi**2 * max(total, 0.0))
 
 
 def root(variance: float, error: float) -> tuple[float, float]:
@@ -375,10 +381,14 @@ class _Frames:
         if times is not None:
             seconds = [float(time) for time in times]
             if len(seconds) != len(self.levels):
-                raise ValueError(f"{len(seconds)} exposure times for {len(self.levels)} levels of {what}: expected one each.")
+                raise ValueError(
+                    f"{len(seconds)} exposure times for {len(self.levels)} levels of {what}: expected one each."
+                )
             for index, time in enumerate(seconds):
                 if not (math.isfinite(time) and (time > 0 or (time == 0 and what == "darks"))):
-                    raise ValueError(f"{what}[{index}] has an exposure time of {time:g} s: expected seconds > 0, such as 0.01.")
+                    raise ValueError(
+                        f"{what}[{index}] has an exposure time of {time:g} s: expected seconds > 0, such as 0.01."
+                    )
             self.times = list(seconds)
 
     def read(self, index: int, shape: tuple[int, int] | None) -> np.ndarray:
@@ -419,7 +429,9 @@ def _levels(given: Any, what: str) -> list[list[Any]]:
     levels = [list(level) for level in given]
     for index, level in enumerate(levels):
         if len(level) < 2:
-            raise ValueError(f"{what}[{index}] is {len(level)} frame: expected a pair (2,H,W), whose difference is the noise.")
+            raise ValueError(
+                f"{what}[{index}] is {len(level)} frame: expected a pair (2,H,W), whose difference is the noise."
+            )
     return levels
 
 
@@ -472,7 +484,9 @@ def _check_bits(bits: int | None, highest: float, piled: float, steps: int, note
         bits = next((usual for usual in USUAL_BITS if highest < 2**usual), math.ceil(exact))
         notes.append(f"{bits} bits are a guess from the highest value, {highest:g} DN: say bits to be sure")
     if highest > 2**bits - 1:
-        raise ValueError(f"the highest value is {highest:g} DN, above {2**bits - 1}, full scale of {bits} bits: say bits={math.ceil(exact)}.")
+        raise ValueError(
+            f"the highest value is {highest:g} DN, above {2**bits - 1}, full scale of {bits} bits: say bits={math.ceil(exact)}."
+        )
     return bits
 
 
@@ -496,7 +510,12 @@ def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> No
         return
     greens, others = (crossed, straight) if pattern in ("RGGB", "BGGR") else (straight, crossed)
     if greens > 0.05 and others < greens / 3:
-        row, column = {"RGGB": ("GBRG", "GRBG"), "BGGR": ("GRBG", "GBRG"), "GRBG": ("BGGR", "RGGB"), "GBRG": ("RGGB", "BGGR")}[pattern]
+        row, column = {
+            "RGGB": ("GBRG", "GRBG"),
+            "BGGR": ("GRBG", "GBRG"),
+            "GRBG": ("BGGR", "RGGB"),
+            "GBRG": ("RGGB", "BGGR"),
+        }[pattern]
         raise ValueError(
             f"the two greens of {pattern} differ by {100 * greens:.0f} %, and its red and blue by {100 * others:.0f} %: the "
             f"colour filter is off by one pixel. Use pattern {column} (one column) or {row} (one row)."
@@ -560,7 +579,9 @@ def photon_transfer(
             if shape is None:
                 shape = stack.shape[1:]
                 if min(size // step for size, step in zip(shape, tile, strict=True)) < 8:
-                    raise ValueError(f"frames of {shape[0]} x {shape[1]} pixels are too small: expected 16 x 16 or more.")
+                    raise ValueError(
+                        f"frames of {shape[0]} x {shape[1]} pixels are too small: expected 16 x 16 or more."
+                    )
                 dark = float(stack.mean())
             _check_pair(stack, dark, [source.name(index, number) for number in range(len(stack))])
             top = float(stack.max())
@@ -625,9 +646,7 @@ def photon_transfer(
             sums = [_sums(plane) for plane in _planes(stack, cells[name], tile)]
             held = flat_sums.get(name)
             flat_sums[name] = sums if held is None else [a + b for a, b in zip(held, sums, strict=True)]
-    channels = {
-        name: fit.result(dark_sums[name], flat_sums.get(name, []), notes=notes) for name, fit in fits.items()
-    }
+    channels = {name: fit.result(dark_sums[name], flat_sums.get(name, []), notes=notes) for name, fit in fits.items()}
     black = float(np.mean([channel.black_level for channel in channels.values()]))
     return SensorCalibration(bits, black, pattern, channels, tuple(dict.fromkeys(notes)))
 
@@ -652,11 +671,7 @@ class _Transfer:
         self.saturation, self.saturation_error, self.saturates = self._saturation()
         self.linear = self._linear()
         self.slope, self.height, self.covariance = self._line()
-        inside = [
-            (index, level)
-            for (index, level), linear in zip(self.order, self.linear, strict=True)
-            if linear
-        ]
+        inside = [(index, level) for (index, level), linear in zip(self.order, self.linear, strict=True) if linear]
         half = [i for i, level in inside if level.mean - self.black > 0.1 * (self.limit - self.black)]
         self.even = set(half or [index for index, _ in inside[-1:]])
 
@@ -708,7 +723,11 @@ class _Transfer:
         if max(level.top for level in self.flats) > 1e-3:
             return self.scale, 0.3, saturates
         last = self.flats[-1].mean
-        return last, math.sqrt(max(expected[-1], 0.0) + dark) + (last - self.flats[max(len(self.flats) - 2, 0)].mean), saturates
+        return (
+            last,
+            math.sqrt(max(expected[-1], 0.0) + dark) + (last - self.flats[max(len(self.flats) - 2, 0)].mean),
+            saturates,
+        )
 
     @property
     def limit(self) -> float:
@@ -764,7 +783,7 @@ class _Transfer:
         temporal = max(height, 0.0) + slope * signal
         uneven = max(level.spread - temporal / level.frames, 0.0)
         rounded = temporal + 1 / 12
-        _, hidden = _hidden(temporal, uneven)
+        hidden = _hidden(temporal, temporal + uneven)
         drawn = 2 * (rounded**2 + slope**2 * uneven) / (level.frames - 1) + slope**3 * signal / level.frames
         moved = slope**2 * rounded / (level.frames * level.pixels)
         return drawn / level.pixels + moved + hidden**2
@@ -810,13 +829,24 @@ class _Transfer:
     def _read_noise(self) -> Quantity:
         if self.cut:
             return _unknown("read_noise", self._below_black())
-        error = math.sqrt(self.covariance[0, 0] + (self.slope * self.black_error) ** 2)
+        # what rounding hides is alike in all darks
+        hidden = max(
+            _hidden(self.height, self.height + max(d.spread - self.height / d.frames, 0.0)) for d in self.darks
+        )
+        error = math.sqrt(self.covariance[0, 0] + (self.slope * self.black_error) ** 2 + hidden**2)
         if max(d.variance for d in self.darks) < 0.24 and error > 0.5 * max(self.height, 0.0):
             most = 0.4 / self.slope
-            return _unknown("read_noise", f"rounding hides it: it is below 0.4 DN, {most:.3g} electrons. Raise the gain")
+            return _unknown(
+                "read_noise", f"rounding hides it: it is below 0.4 DN, {most:.3g} electrons. Raise the gain"
+            )
         found = _known("read_noise", *self._per_electron(*root(self.height, error)))
         if math.isnan(self.rate):
-            return Quantity(found.value, found.standard_error, found.unit, "with the shot noise of the dark current, as the darks have one exposure time or none is known")
+            return Quantity(
+                found.value,
+                found.standard_error,
+                found.unit,
+                "with the shot noise of the dark current, as the darks have one exposure time or none is known",
+            )
         return found
 
     def _dsnu(self, split: _Split) -> Quantity:
@@ -825,16 +855,23 @@ class _Transfer:
         temporal = max(self.height, 0.0)
         spread = max(split.total, 0.0)
         if all(d.variance == 0 for d in self.darks) and spread == 0:
-            return _unknown("dsnu", f"rounding hides it: all dark pixels are the same number, {self.darks[0].mean:g} DN. Raise the gain")
-        _, hidden = _hidden(temporal, spread)
+            return _unknown(
+                "dsnu",
+                f"rounding hides it: all dark pixels are the same number, {self.darks[0].mean:g} DN. Raise the gain",
+            )
+        hidden = _hidden(temporal + spread, temporal + spread)
         variance = split.total - (1 / 12 - float(rounding_variance(temporal)))
         return _known("dsnu", *self._per_electron(*root(variance, math.hypot(split.error, hidden))))
 
     def _light(self, darks: list[_Sums], flats: list[_Sums]) -> tuple[_Split | None, np.ndarray]:
         """The pattern of the gain, relative to the even light."""
         splits, maps = [], []
+        # darks of other times than the flats' differ in their mean, but not in their pattern
+        times = [level.time for index, level in self.order if index in self.even]
+        exposed = 0.0 if None in times or math.isnan(self.rate) else float(np.mean([time or 0.0 for time in times]))
+        level_of_dark = self.black + (0.0 if math.isnan(self.rate) else self.rate) * exposed
         for dark, flat in zip(darks, flats, strict=bool(flats)) if flats else ():
-            image = flat.mean - dark.mean
+            image = flat.mean - (dark.mean - dark.mean.mean()) - level_of_dark
             smooth, order = _smooth(image)
             smooth = np.maximum(smooth, 0.02 * smooth.mean())
             pattern = image / smooth - 1
@@ -846,11 +883,17 @@ class _Transfer:
     def _full_well(self) -> Quantity:
         if self.saturation is None:
             share = (self.flats[-1].mean - self.black) / (self.scale - self.black)
-            return _unknown("full_well", f"no flat saturates: the brightest is {share:.2f} of full scale. Expose longer")
+            return _unknown(
+                "full_well", f"no flat saturates: the brightest is {share:.2f} of full scale. Expose longer"
+            )
         error = math.hypot(self.saturation_error, self.black_error)
         value, error = self._per_electron(self.saturation - self.black, error)
-        reason = f"the converter ends at {self.scale:g} DN before the well is full" if self.saturation > self.scale - 1 else ""
-        return Quantity(value, error, UNITS["full_well"], reason)
+        reason = (
+            f"the converter ends at {self.scale:g} DN before the well is full"
+            if self.saturation > self.scale - 1
+            else ""
+        )
+        return Quantity(float(value), _WIDER * float(error), UNITS["full_well"], reason)
 
     def _dark_current(self) -> Quantity:
         if math.isnan(self.rate):
@@ -872,11 +915,20 @@ class _Transfer:
             assert_time = level.time or 0.0
             signal = level.mean - self.black - rate * assert_time
             reach = 4 * math.sqrt(level.variance + level.spread)
-            if 0.05 * top <= signal <= (0.95 * top if self.saturation is not None else top) and not full and level.mean + reach < self.limit:
+            if (
+                0.05 * top <= signal <= (0.95 * top if self.saturation is not None else top)
+                and not full
+                and level.mean + reach < self.limit
+            ):
                 points.append((assert_time, signal, math.hypot(_mean_error(level), self.black_error) / signal))
-        times, signals, errors = (np.array(part) for part in zip(*points, strict=True)) if points else (np.empty(0),) * 3
+        times, signals, errors = (
+            (np.array(part) for part in zip(*points, strict=True)) if points else (np.empty(0),) * 3
+        )
         if len(set(times)) < 3:
-            return _unknown("linearity_error", f"{len(set(times))} exposure times lie within 5 to 95 % of saturation: expected 3 or more at one light")
+            return _unknown(
+                "linearity_error",
+                f"{len(set(times))} exposure times lie within 5 to 95 % of saturation: expected 3 or more at one light",
+            )
         solved, _ = _weighted(times, signals, signals**2)
         line = solved[0] + solved[1] * times
         value = float(np.abs(signals / line - 1).mean())
@@ -899,7 +951,8 @@ def _mean_error(level: Level) -> float:
     """Standard error of a level's mean, by its noise and its rounding [DN]."""
     temporal = unrounded(level.variance)
     uneven = max(level.spread - temporal / level.frames, 0.0)
-    return math.hypot(math.sqrt((temporal + 1 / 12) / (level.frames * level.pixels)), _hidden(temporal, uneven)[0])
+    hidden = math.exp(-2 * math.pi**2 * max(temporal + uneven, 0.0)) / math.sqrt(12)
+    return math.hypot(math.sqrt((temporal + 1 / 12) / (level.frames * level.pixels)), hidden)
 
 
 def _shown(maps: Sequence[np.ndarray]) -> np.ndarray:
@@ -908,7 +961,7 @@ def _shown(maps: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _known(name: str, value: float, error: float) -> Quantity:
-    return Quantity(float(value), float(error), UNITS[name])
+    return Quantity(float(value), _WIDER * float(error), UNITS[name])
 
 
 def _unknown(name: str, reason: str) -> Quantity:

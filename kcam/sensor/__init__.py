@@ -1,6 +1,7 @@
 """The sensor: from irradiance to the numbers of a raw picture."""
 
 from kcam.sensor.adc import ADC, quantise
+from kcam.sensor.calibrated import from_calibration
 from kcam.sensor.colour_filter import ColourFilter, fit_gaussians
 from kcam.sensor.exposure import Exposure
 from kcam.sensor.mosaic import PATTERNS, Mosaic, channel_masks, mosaic
@@ -32,6 +33,7 @@ __all__ = [
     "dark_current",
     "fit_gaussians",
     "fixed_pattern",
+    "from_calibration",
     "mosaic",
     "poisson",
     "quantise",
