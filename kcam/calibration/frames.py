@@ -157,7 +157,7 @@ def exposure_time(path: str | os.PathLike[str]) -> float | None:
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Exposure times from a table of two columns, file name and seconds, separated by commas.
+    r"""Exposure times from a table of two columns, file name and seconds, separated by commas.
 
     Returns:   file name (without its folder) -> seconds.
     Raises:    FileNotFoundError; ValueError that names the file and line of what is no time.
@@ -165,7 +165,7 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     Example:
     >>> from pathlib import Path
     >>> from kcam import calibration
-    >>> written = Path("times.csv").write_text("file,seconds\\nf1.tif,0.01\\nf2.tif,0.01\\n")
+    >>> written = Path("times.csv").write_text("file,seconds\nf1.tif,0.01\nf2.tif,0.01\n")
     >>> calibration.read_times("times.csv")
     {'f1.tif': 0.01, 'f2.tif': 0.01}
     """

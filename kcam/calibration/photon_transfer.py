@@ -16,13 +16,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kcam import files
 from kcam.calibration.frames import as_frame
@@ -87,9 +85,10 @@ class Level:
     """What the frames of one exposure say of one channel.
 
     Args:      mean, variance: of the values, and their temporal variance [DN, DN^2].
-               time: exposure [s]; None if unknown.  linear: whether the gain was fitted to it.
+               time: exposure [s]; None if unknown.
                frames, pixels: how many were seen.  spread: variance of the mean frame over its pixels [DN^2].
                top, bottom: shares of the pixels at the highest number of the converter, and at 0.
+               linear: whether the gain was fitted to it.  deviation: from a line over time, relative; None outside.
     """
 
     mean: float
@@ -101,6 +100,7 @@ class Level:
     top: float
     bottom: float
     linear: bool = False
+    deviation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -188,10 +188,7 @@ class SensorCalibration:
                     "unit": found.unit,
                     **told,
                 }
-            curves = {
-                what: [{f.name: getattr(level, f.name) for f in fields(Level)} for level in getattr(channel, what)]
-                for what in ("darks", "flats")
-            }
+            curves = {what: [asdict(level) for level in getattr(channel, what)] for what in ("darks", "flats")}
             channels[name] = numbers | {"black_level": channel.black_level, "levels": curves}
         return {
             "format": FORMAT,
@@ -380,6 +377,15 @@ class _Frames:
         self.times: list[float | None] = [None] * len(self.levels)
         if times is not None:
             seconds = [float(time) for time in times]
+            counts = [len(level) for level in self.levels]
+            if len(seconds) == sum(counts):  # one of each frame
+                by_level = [seconds[sum(counts[:i]) : sum(counts[: i + 1])] for i in range(len(counts))]
+                for index, told in enumerate(by_level):
+                    if len(set(told)) > 1:
+                        raise ValueError(
+                            f"the frames of {what}[{index}] have exposure times of {told} s: expected one."
+                        )
+                seconds = [told[0] for told in by_level]
             if len(seconds) != len(self.levels):
                 raise ValueError(
                     f"{len(seconds)} exposure times for {len(self.levels)} levels of {what}: expected one each."
@@ -410,20 +416,19 @@ class _Frames:
         frame = self.levels[index][number]
         return str(frame) if isinstance(frame, (str, os.PathLike)) else f"{self.what}[{index}][{number}]"
 
-    def __iter__(self) -> Iterator[int]:
-        return iter(range(len(self.levels)))
-
 
 def _levels(given: Any, what: str) -> list[list[Any]]:
     """Frames by level: of levels (n,H,W), of lists of frames, or of frames (H,W) two by two."""
     if given is None or (not hasattr(given, "shape") and len(given) == 0) or getattr(given, "shape", (1,))[0] == 0:
         light = "with the lens capped" if what == "darks" else "of even light"
         raise ValueError(f"there are no {what}: expected at least one pair of frames {light}.")
+    if getattr(given, "ndim", 3) < 3 or isinstance(given, (str, os.PathLike)):
+        raise ValueError(f"{what}: one frame is no pair: expected two frames (H,W) of each exposure.")
     single = [getattr(item, "ndim", 2 if isinstance(item, (str, os.PathLike)) else 3) == 2 for item in given]
     if all(single):
         if len(single) % 2:
-            number = "one frame is" if len(single) == 1 else f"{len(single)} frames are"
-            raise ValueError(f"{what}: {number} no pairs: expected two frames (H,W) of each exposure.")
+            number = "one frame is no pair" if len(single) == 1 else f"{len(single)} frames are no pairs"
+            raise ValueError(f"{what}: {number}: expected two frames (H,W) of each exposure.")
         frames = list(given)
         return [list(pair) for pair in zip(frames[::2], frames[1::2], strict=True)]
     levels = [list(level) for level in given]
@@ -444,11 +449,6 @@ def _cells(pattern: str | None) -> dict[str, list[tuple[int, int]]]:
         CHANNELS[channel]: [(int(y), int(x)) for y, x in (tile == channel).nonzero()]
         for channel in sorted(int(value) for value in tile.unique())
     }
-
-
-def _planes(stack: np.ndarray, cells: Sequence[tuple[int, int]], tile: tuple[int, int]) -> list[np.ndarray]:
-    height, width = (size // step * step for size, step in zip(stack.shape[1:], tile, strict=True))
-    return [stack[:, y : height : tile[0], x : width : tile[1]] for y, x in cells]
 
 
 def _check_pair(stack: np.ndarray, dark: float, names: Sequence[str]) -> None:
@@ -485,7 +485,8 @@ def _check_bits(bits: int | None, highest: float, piled: float, steps: int, note
         notes.append(f"{bits} bits are a guess from the highest value, {highest:g} DN: say bits to be sure")
     if highest > 2**bits - 1:
         raise ValueError(
-            f"the highest value is {highest:g} DN, above {2**bits - 1}, full scale of {bits} bits: say bits={math.ceil(exact)}."
+            f"the highest value is {highest:g} DN, above {2**bits - 1}, full scale of {bits} bits: say "
+            f"bits={math.ceil(exact)}."
         )
     return bits
 
@@ -504,8 +505,8 @@ def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> No
             green = "RGGB or BGGR" if crossed < straight else "GRBG or GBRG"
             raise ValueError(
                 "the four cells of 2 x 2 pixels have light of their own, up to "
-                f"{100 * (1 - min(pattern_cells.values()) / size):.0f} % apart: a colour filter lies on this sensor. Say its "
-                f'pattern, such as {green}; "" is for a monochrome one.'
+                f"{100 * (1 - min(pattern_cells.values()) / size):.0f} % apart: a colour filter lies on this sensor. Say "
+                f"its pattern, such as {green}."
             )
         return
     greens, others = (crossed, straight) if pattern in ("RGGB", "BGGR") else (straight, crossed)
@@ -517,8 +518,8 @@ def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> No
             "GBRG": ("RGGB", "BGGR"),
         }[pattern]
         raise ValueError(
-            f"the two greens of {pattern} differ by {100 * greens:.0f} %, and its red and blue by {100 * others:.0f} %: the "
-            f"colour filter is off by one pixel. Use pattern {column} (one column) or {row} (one row)."
+            f"the two greens of {pattern} differ by {100 * greens:.0f} %, and its red and blue by {100 * others:.0f} %: "
+            f"the colour filter is off by one pixel. Use pattern {column} (one column) or {row} (one row)."
         )
 
 
@@ -562,115 +563,122 @@ def photon_transfer(
     (True, True)
     """
     pattern = pattern or None
-    cells = _cells(pattern)
-    tile = (1, 1) if pattern is None else (len(PATTERNS[pattern]), len(PATTERNS[pattern][0]))
     dark_frames, flat_frames = _Frames(darks, "darks", dark_times), _Frames(flats, "flats", exposure_times)
     notes: list[str] = []
-
-    # once through all frames for what each level says ...
-    shape: tuple[int, int] | None = None
-    highest, piled, steps, dark = 0.0, 0.0, 0, 0.0
-    seen: dict[str, dict[str, list[dict[str, Any]]]] = {name: {"darks": [], "flats": []} for name in cells}
-    light: dict[tuple[int, int], float] = dict.fromkeys([(0, 0), (0, 1), (1, 0), (1, 1)], 0.0)
-    dark_sums: dict[str, list[_Sums]] = {}
-    for source in (dark_frames, flat_frames):
-        for index in source:
-            stack = source.read(index, shape)
-            if shape is None:
-                shape = stack.shape[1:]
-                if min(size // step for size, step in zip(shape, tile, strict=True)) < 8:
-                    raise ValueError(
-                        f"frames of {shape[0]} x {shape[1]} pixels are too small: expected 16 x 16 or more."
-                    )
-                dark = float(stack.mean())
-            _check_pair(stack, dark, [source.name(index, number) for number in range(len(stack))])
-            top = float(stack.max())
-            share = float((stack == top).mean())
-            if top > highest:
-                highest, piled = top, share
-            elif top == highest:
-                piled = max(piled, share)
-            steps = math.gcd(steps, int(np.gcd.reduce(stack.astype(np.int64).ravel())))
-            if source is flat_frames and share < 0.01:
-                for y, x in light:
-                    light[y, x] += float(stack[:, y::2, x::2].mean()) - dark
-            for name, places in cells.items():
-                sums = [_sums(plane) for plane in _planes(stack, places, tile)]
-                if source is dark_frames:
-                    before = dark_sums.get(name)
-                    dark_sums[name] = sums if before is None else [a + b for a, b in zip(before, sums, strict=True)]
-                seen[name][source.what].append(
-                    {
-                        "mean": float(np.mean([s.mean.mean() for s in sums])),
-                        "variance": float(np.mean([s.variance.mean() / s.frames for s in sums])),
-                        "time": source.times[index],
-                        "frames": len(stack),
-                        "pixels": sum(s.total.size for s in sums),
-                        "spread": float(np.mean([s.mean.var(ddof=1) for s in sums])),
-                        "top": top,
-                        "index": index,
-                        "stack": [
-                            (float((p == top).mean()), float((p == 0).mean())) for p in _planes(stack, places, tile)
-                        ],
-                    }
-                )
-    bits = _check_bits(bits, highest, piled, steps if highest else 1, notes)
-    scale = float(2**bits - 1)
-    if (pattern is None or tile == (2, 2)) and max(light.values()) > 0:
-        _check_phase(light, pattern)
-
-    fits = {}
-    for name, found in seen.items():
-        levels = {
-            what: [
-                (
-                    level["index"],
-                    Level(
-                        **{k: level[k] for k in ("mean", "variance", "time", "frames", "pixels", "spread")},
-                        top=float(np.mean([t for t, _ in level["stack"]])) if level["top"] == scale else 0.0,
-                        bottom=float(np.mean([b for _, b in level["stack"]])),
-                    ),
-                )
-                for level in found[what]
-            ]
-            for what in ("darks", "flats")
-        }
-        fits[name] = _Transfer(name, [level for _, level in levels["darks"]], levels["flats"], scale)
-
-    # ... and once more through those that are linear, for the fixed pattern of the gain
-    flat_sums: dict[str, list[_Sums]] = {}
-    for index in flat_frames:
-        wanted = [name for name, fit in fits.items() if index in fit.even]
-        stack = flat_frames.read(index, shape) if wanted else np.empty(0)
-        for name in wanted:
-            sums = [_sums(plane) for plane in _planes(stack, cells[name], tile)]
-            held = flat_sums.get(name)
-            flat_sums[name] = sums if held is None else [a + b for a, b in zip(held, sums, strict=True)]
-    channels = {name: fit.result(dark_sums[name], flat_sums.get(name, []), notes=notes) for name, fit in fits.items()}
+    survey = _Survey(pattern)
+    for frames in (dark_frames, flat_frames):
+        for index in range(len(frames.levels)):
+            survey.look(frames, index)
+    bits = _check_bits(bits, survey.highest, survey.piled, survey.steps or 1, notes)
+    if (pattern is None or len(PATTERNS[pattern]) == 2) and max(survey.light.values()) > 0:
+        _check_phase(survey.light, pattern)
+    transfers = {name: _Transfer(name, *survey.levels(name, float(2**bits - 1))) for name in survey.cells}
+    patterns: dict[str, list[_Sums]] = {name: [] for name in transfers}
+    for index in range(len(flat_frames.levels)):  # once more through those that show the pattern of the gain
+        wanted = [name for name, transfer in transfers.items() if index in transfer.even]
+        if wanted:
+            stack = flat_frames.read(index, survey.shape)
+            for name in wanted:
+                patterns[name] = _added(patterns[name], survey.sums(stack, name))
+    channels = {name: t.result(survey.dark[name], patterns[name], notes=notes) for name, t in transfers.items()}
     black = float(np.mean([channel.black_level for channel in channels.values()]))
     return SensorCalibration(bits, black, pattern, channels, tuple(dict.fromkeys(notes)))
+
+
+def _added(before: list[_Sums], more: list[_Sums]) -> list[_Sums]:
+    return [one + other for one, other in zip(before, more, strict=True)] if before else more
+
+
+class _Survey:
+    """What one look at all frames tells: the levels of each channel, and what the values are.
+
+    highest, piled: the highest value, and the share of a level that stands there.  steps: what all values are multiples
+    of.  light: sum of the means above black by cell of 2 x 2 pixels.  dark: by channel, all darks added up.
+    """
+
+    def __init__(self, pattern: str | None) -> None:
+        self.cells = _cells(pattern)
+        self.tile = (1, 1) if pattern is None else (len(PATTERNS[pattern]), len(PATTERNS[pattern][0]))
+        self.shape: tuple[int, int] | None = None
+        self.highest, self.piled, self.steps, self.black = 0.0, 0.0, 0, 0.0
+        self.light = dict.fromkeys([(0, 0), (0, 1), (1, 0), (1, 1)], 0.0)
+        self.dark: dict[str, list[_Sums]] = {name: [] for name in self.cells}
+        self.seen: dict[tuple[str, str], list[tuple[float, Level]]] = {}
+
+    def planes(self, stack: np.ndarray, name: str) -> list[np.ndarray]:
+        """The pixels of one channel, a plane (n,H,W) for each of its places in the tile."""
+        height, width = (size // step * step for size, step in zip(stack.shape[1:], self.tile, strict=True))
+        return [stack[:, y : height : self.tile[0], x : width : self.tile[1]] for y, x in self.cells[name]]
+
+    def sums(self, stack: np.ndarray, name: str) -> list[_Sums]:
+        """The planes of one channel, added up."""
+        return [_sums(plane) for plane in self.planes(stack, name)]
+
+    def look(self, frames: _Frames, index: int) -> None:
+        """Take the frames of one level into account."""
+        stack = frames.read(index, self.shape)
+        if self.shape is None:
+            self.shape = (stack.shape[1], stack.shape[2])
+            least = [8 * step for step in self.tile]
+            if any(size < small for size, small in zip(self.shape, least, strict=True)):
+                told = f"{self.shape[0]} x {self.shape[1]}"
+                raise ValueError(f"frames of {told} pixels are too small: expected at least {least[0]} x {least[1]}.")
+            self.black = float(stack.mean())
+        _check_pair(stack, self.black, [frames.name(index, number) for number in range(len(stack))])
+        top = float(stack.max())
+        share = float((stack == top).mean())
+        self.piled = share if top > self.highest else max(share, self.piled) if top == self.highest else self.piled
+        self.highest = max(top, self.highest)
+        self.steps = math.gcd(self.steps, int(np.gcd.reduce(stack.astype(np.int64).ravel())))
+        if frames.what == "flats" and share < 0.01:
+            for y, x in self.light:
+                self.light[y, x] += float(stack[:, y::2, x::2].mean()) - self.black
+        for name in self.cells:
+            planes, sums = self.planes(stack, name), self.sums(stack, name)
+            if frames.what == "darks":
+                self.dark[name] = _added(self.dark[name], sums)
+            level = Level(
+                mean=float(np.mean([s.mean.mean() for s in sums])),
+                variance=float(np.mean([s.variance.mean() / s.frames for s in sums])),
+                time=frames.times[index],
+                frames=len(stack),
+                pixels=sum(s.total.size for s in sums),
+                spread=float(np.mean([s.mean.var(ddof=1) for s in sums])),
+                top=float(np.mean([(plane == top).mean() for plane in planes])),
+                bottom=float(np.mean([(plane == 0).mean() for plane in planes])),
+            )
+            self.seen.setdefault((name, frames.what), []).append((top, level))
+
+    def levels(self, name: str, scale: float) -> tuple[list[Level], list[Level], float]:
+        """Darks and flats of a channel, and full scale [DN]."""
+        darks, flats = (
+            [level if top == scale else replace(level, top=0.0) for top, level in self.seen[name, what]]
+            for what in ("darks", "flats")
+        )
+        return darks, flats, scale
 
 
 class _Transfer:
     """The photon transfer curve of one channel.
 
-    Args:      darks: levels without light.  flats: (index of the level, level).  scale: highest number [DN].
+    Args:      darks, flats: its levels, as they were given.  scale: highest number of the converter [DN].
     """
 
-    def __init__(self, name: str, darks: list[Level], flats: list[tuple[int, Level]], scale: float) -> None:
+    def __init__(self, name: str, darks: list[Level], flats: list[Level], scale: float) -> None:
         self.name, self.darks, self.scale = name, darks, scale
-        self.order = sorted(flats, key=lambda item: item[1].mean)
+        self.order = sorted(enumerate(flats), key=lambda item: item[1].mean)
         self.flats = [level for _, level in self.order]
         self.cut = max(level.bottom for level in darks) > _CUT
         self.black, self.black_error, self.rate, self.rate_error = self._black()
         if self.flats[-1].mean - self.black < 3 * max(_mean_error(self.flats[-1]), 0.05):
             raise ValueError(
-                f"the flats show no light in {name}: their highest mean, {self.flats[-1].mean:.2f} DN, is that of the darks. "
-                "Are darks and flats mixed up?"
+                f"the flats show no light in {name}: their highest mean, {self.flats[-1].mean:.2f} DN, is "
+                "that of the darks. Are darks and flats mixed up?"
             )
         self.saturation, self.saturation_error, self.saturates = self._saturation()
         self.linear = self._linear()
-        self.slope, self.height, self.covariance = self._line()
+        self.slope, self.height, self.covariance = self._line(self.darks)
+        self.clamped = self._clamp()
         inside = [(index, level) for (index, level), linear in zip(self.order, self.linear, strict=True) if linear]
         half = [i for i, level in inside if level.mean - self.black > 0.1 * (self.limit - self.black)]
         self.even = set(half or [index for index, _ in inside[-1:]])
@@ -708,8 +716,9 @@ class _Transfer:
             return None, math.nan, saturates
         if all(saturates):
             raise ValueError(
-                f"all flats are saturated in {self.name}: the darkest has a mean of {self.flats[0].mean:.1f} DN. Expected levels "
-                "from dark to bright, several below 70 % of saturation: shorten the exposure, 10 times for one of them."
+                f"all flats are saturated in {self.name}: the darkest has a mean of {self.flats[0].mean:.1f} DN. "
+                "Expected levels from dark to bright, several below 70 % of saturation: shorten the exposure, 10 times "
+                "for one of them."
             )
         plateau = [
             level
@@ -739,7 +748,7 @@ class _Transfer:
 
         def fits(level: Level, most: float, sigmas: float) -> bool:
             reach = sigmas * math.sqrt(level.variance + level.spread)
-            return level.mean - self.black <= most * (self.limit - self.black) and level.mean + reach < self.limit
+            return bool(level.mean - self.black <= most * (self.limit - self.black) and level.mean + reach < self.limit)
 
         for most, sigmas in ((LINEAR, 4.0), (LINEAR, 3.0), (1.0, 4.0), (1.0, 3.0)):
             chosen = [
@@ -749,14 +758,35 @@ class _Transfer:
             if any(chosen):
                 return chosen
         raise ValueError(
-            f"no flat in {self.name} lies between black and saturation, {self.black:.0f} to {self.limit:.0f} DN with its noise: "
-            "add levels at 10 to 70 % of saturation."
+            f"no flat in {self.name} lies between black and saturation, {self.black:.0f} to {self.limit:.0f} DN with "
+            "its noise: add levels at 10 to 70 % of saturation."
         )
 
-    def _line(self) -> tuple[float, float, np.ndarray]:
+    def _clamp(self) -> bool:
+        """Whether the camera takes the dark signal off, so that darks of long exposure gain in variance alone.
+
+        The dark current is then in the variance: d sigma_y^2 / dt = K^2 mu_I.
+        """
+        if math.isnan(self.rate) or self.cut:
+            return False
+        times = np.array([level.time for level in self.darks], float)
+        noise = np.array([unrounded(level.variance) for level in self.darks])
+        errors = np.array([2 * (level.variance**2) / (level.frames - 1) / level.pixels for level in self.darks])
+        solved, covariance = _weighted(times, noise, errors)
+        rate, error = float(solved[1]), math.sqrt(covariance[1, 1])
+        short = [level for level in self.darks if level.time == times.min()]
+        slope, height, line = self._line(short)
+        expected = slope * self.rate
+        if rate - expected < 5 * math.hypot(error, slope * self.rate_error) or expected > 0.2 * rate:
+            return False
+        self.slope, self.height, self.covariance = slope, height, line
+        self.variance_rate = (rate / slope, error / slope)
+        return True
+
+    def _line(self, darks: list[Level]) -> tuple[float, float, np.ndarray]:
         """Gain [DN / electron], variance at the black level without rounding [DN^2], and their covariance."""
         points = [level for level, linear in zip(self.flats, self.linear, strict=True) if linear]
-        points = ([] if self.cut else self.darks) + points
+        points = ([] if self.cut else darks) + points
         signal = np.array([level.mean - self.black for level in points])
         noise = np.array([unrounded(level.variance) for level in points])
         slope, height = max(float(noise[-1] / signal[-1]), 1e-12), max(min(noise), 1e-3)
@@ -772,8 +802,8 @@ class _Transfer:
                 break
         if slope <= 0 or slope < 3 * math.sqrt(covariance[1, 1]):
             raise ValueError(
-                f"the noise in {self.name} does not grow with the light: variances from {noise.min():.3g} to {noise.max():.3g} "
-                "DN^2. Are the two frames of each pair taken anew, and raw?"
+                f"the noise in {self.name} does not grow with the light: variances from {noise.min():.3g} to "
+                f"{noise.max():.3g} DN^2. Are the two frames of each pair taken anew, and raw?"
             )
         return slope, height, covariance
 
@@ -798,6 +828,7 @@ class _Transfer:
             )
         split = _pooled([_split(s.mean, temporal=s.mean_variance.mean(), freedom=s.freedom) for s in darks])
         light, light_map = self._light(darks, flats)
+        linearity, deviations = self._linearity()
         return ChannelCalibration(
             gain=_known("gain", self.slope, gain_error),
             read_noise=self._read_noise(),
@@ -805,14 +836,13 @@ class _Transfer:
             dsnu=self._dsnu(split),
             full_well=self._full_well(),
             dark_current=self._dark_current(),
-            linearity_error=self._linearity(),
+            linearity_error=linearity,
             black_level=self.black,
             saturation=self.saturation,
             dark_variance=max(self.height, 0.0),
             darks=tuple(self.darks),
             flats=tuple(
-                Level(**{f.name: getattr(level, f.name) for f in fields(Level)} | {"linear": linear})
-                for level, linear in zip(self.flats, self.linear, strict=True)
+                replace(f, linear=x, deviation=deviations.get(f)) for f, x in zip(self.flats, self.linear, strict=True)
             ),
             dark_pattern=split.spatial(_shown([s.mean for s in darks])),
             light_pattern=light.spatial(light_map) if light else None,
@@ -902,38 +932,34 @@ class _Transfer:
             return _unknown("dark_current", f"{what}: expected two times or more, such as 0.1 s and 10 s")
         if self.cut:
             return _unknown("dark_current", self._below_black())
+        if self.clamped:
+            found = _known("dark_current", *self._per_electron(*self.variance_rate))
+            return replace(found, reason="from the variance, as the camera takes the mean dark signal off")
         return _known("dark_current", *self._per_electron(self.rate, self.rate_error))
 
-    def _linearity(self) -> Quantity:
-        """Mean relative deviation from the line of least relative deviations, from 5 to 95 % of saturation."""
+    def _linearity(self) -> tuple[Quantity, dict[Level, float]]:
+        """Mean relative deviation from the line of least relative deviations, 5 to 95 % of saturation, and each one."""
+        name = "linearity_error"
         if any(level.time is None for level in self.flats):
-            return _unknown("linearity_error", "the exposure times of the flats are unknown: name them, at one light")
+            return _unknown(name, "the exposure times of the flats are unknown: name them, at one light"), {}
         rate = 0.0 if math.isnan(self.rate) else self.rate
-        top = self.limit - self.black if self.saturation is not None else self.flats[-1].mean - self.black
-        points = []
+        top = self.limit - self.black if self.saturation is not None else (self.flats[-1].mean - self.black) / 0.95
+        points: dict[Level, tuple[float, float, float]] = {}
         for level, full in zip(self.flats, self.saturates, strict=True):
-            assert_time = level.time or 0.0
-            signal = level.mean - self.black - rate * assert_time
-            reach = 4 * math.sqrt(level.variance + level.spread)
-            if (
-                0.05 * top <= signal <= (0.95 * top if self.saturation is not None else top)
-                and not full
-                and level.mean + reach < self.limit
-            ):
-                points.append((assert_time, signal, math.hypot(_mean_error(level), self.black_error) / signal))
-        times, signals, errors = (
-            (np.array(part) for part in zip(*points, strict=True)) if points else (np.empty(0),) * 3
-        )
-        if len(set(times)) < 3:
-            return _unknown(
-                "linearity_error",
-                f"{len(set(times))} exposure times lie within 5 to 95 % of saturation: expected 3 or more at one light",
-            )
+            time = level.time or 0.0
+            signal = level.mean - self.black - rate * time
+            below = level.mean + 4 * math.sqrt(level.variance + level.spread) < self.limit and not full
+            if 0.05 * top <= signal <= 0.9501 * top and below:
+                points[level] = (time, signal, math.hypot(_mean_error(level), self.black_error) / signal)
+        if len({time for time, _, _ in points.values()}) < 3:
+            return _unknown(name, "fewer than 3 exposure times lie within 5 to 95 % of saturation: take more"), {}
+        times, signals, errors = np.array(list(points.values())).T
         solved, _ = _weighted(times, signals, signals**2)
-        line = solved[0] + solved[1] * times
-        value = float(np.abs(signals / line - 1).mean())
+        deviations = signals / (solved[0] + solved[1] * times) - 1
         floor = math.sqrt(2 / math.pi) * float(errors.mean())  # of a straight sensor, by noise alone
-        return _known("linearity_error", value, float(np.sqrt((errors**2).sum())) / len(errors) + floor / 2)
+        error = float(np.sqrt((errors**2).sum())) / len(errors) + floor / 2
+        found = _known(name, float(np.abs(deviations).mean()), error)
+        return found, dict(zip(points, map(float, deviations), strict=True))
 
 
 def _weighted(x: np.ndarray, y: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+import textwrap
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from kcam import plots
-from kcam.calibration.photon_transfer import MONO, UNITS, ChannelCalibration, Level, SensorCalibration, Spatial
+from kcam.calibration.photon_transfer import MONO, UNITS, ChannelCalibration, SensorCalibration, Spatial
 from kcam.plots import INK, LABEL, MUTED, SMALL, TITLE, Sheet
 from kcam.report import write_report
 
@@ -74,15 +75,9 @@ def transfer_figure(found: SensorCalibration) -> Figure:
         if not axes.lines:
             told = next(iter(found.channels.values())).quantities()[reason].reason
             place = {"transform": axes.transAxes, "ha": "center", "va": "center", "size": SMALL, "color": MUTED}
-            axes.text(0.5, 0.5, "\n".join(_wrapped(told or "unknown")), **place)
+            axes.text(0.5, 0.5, "\n".join(textwrap.wrap(told or "unknown", 52)), **place)
             axes.set(xticks=[], yticks=[])
     return sheet.figure
-
-
-def _wrapped(text: str) -> list[str]:
-    import textwrap
-
-    return textwrap.wrap(text, 52)
 
 
 def _draw_transfer(axes: Any, channel: ChannelCalibration, name: str, colour: str) -> None:
@@ -98,7 +93,7 @@ def _draw_transfer(axes: Any, channel: ChannelCalibration, name: str, colour: st
     if below:
         axes.plot(*zip(*below, strict=True), ls="", marker="s", ms=4.5, mec=colour, mfc=colour)
     top = max(level.mean for level in channel.flats) - black
-    signal = np.geomspace(max(1e-3 * top, 0.3), top, 100)
+    signal = np.geomspace(min(min((x for x, _ in below), default=top), 1e-3 * top), top, 200)
     axes.plot(signal, channel.dark_variance + 1 / 12 + gain * signal, color=colour, lw=1.2, label=label)
     if channel.saturation is not None:
         axes.axvline(channel.saturation - black, color=colour, lw=0.8, ls=(0, (3, 2)), alpha=0.6)
@@ -107,7 +102,8 @@ def _draw_transfer(axes: Any, channel: ChannelCalibration, name: str, colour: st
 def _draw_ratio(axes: Any, channel: ChannelCalibration, name: str, colour: str) -> None:
     """As measured, as the model has it with the fixed pattern (whole line) and without (dashed)."""
     gain, black = channel.gain.value or 1.0, channel.black_level
-    shown = [(f.mean - black, f.variance) for f in channel.flats if f.mean > black and f.variance > 0]
+    full = black + 0.95 * ((channel.saturation or math.inf) - black)
+    shown = [(f.mean - black, f.variance) for f in channel.flats if black < f.mean < full and f.variance > 0]
     electrons = np.array([mean / gain for mean, _ in shown])
     axes.plot(electrons, [m / math.sqrt(v) for m, v in shown], ls="", marker="o", ms=4.5, mec=colour, mfc="white")
     signal = np.geomspace(max(electrons.min() / 30, 1.0), channel.full_well.value or electrons.max(), 100)
@@ -118,14 +114,10 @@ def _draw_ratio(axes: Any, channel: ChannelCalibration, name: str, colour: str) 
 
 
 def _draw_line(axes: Any, channel: ChannelCalibration, colour: str) -> None:
-    black, top = channel.black_level, (channel.saturation or max(f.mean for f in channel.flats)) - channel.black_level
-    inside: list[Level] = [f for f in channel.flats if f.time is not None and 0.05 * top < f.mean - black < 0.95 * top]
-    if len({level.time for level in inside}) < 3:
+    shown = [(level.time, 100 * level.deviation) for level in channel.flats if level.deviation is not None]
+    if not shown:
         return
-    times = np.array([level.time for level in inside])
-    signal = np.array([level.mean - black for level in inside])
-    slope, height = np.polyfit(times, signal, 1, w=1 / signal)
-    axes.plot(times, 100 * (signal / (height + slope * times) - 1), color=colour, marker="o", ms=4, lw=1.0)
+    axes.plot(*zip(*sorted(shown), strict=True), color=colour, marker="o", ms=4, lw=1.0)
     axes.axhline(0, color=MUTED, lw=0.8)
 
 
@@ -161,7 +153,8 @@ def spatial_figure(pattern: Spatial, *, title: str, unit: str, scale: float = 1.
         axes.plot(
             np.arange(1, len(power)) / count, np.sqrt(np.maximum(power[1:], 1e-24)), color=colour, lw=1.0, label=name
         )
-    axes.set(yscale="log", xlim=(0, 0.5))
+    low, high = axes.get_ylim()
+    axes.set(yscale="log", xlim=(0, 0.5), ylim=(min(low, high / 30), 1.5 * high))
     _key(axes, loc="upper right", ncols=2)
     axes = _panel(sheet, 1, 1, "Histogram, and the normal one of the same spread", x=unit, y="pixels")
     counts, edges = np.histogram(image, bins=min(256, max(16, int(math.sqrt(image.size)))))

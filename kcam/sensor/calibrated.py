@@ -94,8 +94,8 @@ def from_calibration(
         check_positive(exposure_time, name="exposure_time", unit="s")
         if dark_current is None:
             raise ValueError(
-                f"{path} has no dark current for an exposure of {exposure_time:g} s: leave exposure_time out, or calibrate "
-                "with darks of several exposure times."
+                f"{path} has no dark current for an exposure of {exposure_time:g} s: leave exposure_time out, or "
+                "calibrate with darks of several exposure times."
             )
         stages.append(DarkCurrent(max(dark_current, 0.0), time=exposure_time, full_well=capacity))
     if prnu is not None or dsnu is not None:
