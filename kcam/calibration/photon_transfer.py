@@ -505,8 +505,8 @@ def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> No
             green = "RGGB or BGGR" if crossed < straight else "GRBG or GBRG"
             raise ValueError(
                 "the four cells of 2 x 2 pixels have light of their own, up to "
-                f"{100 * (1 - min(pattern_cells.values()) / size):.0f} % apart: a colour filter lies on this sensor. Say "
-                f"its pattern, such as {green}."
+                f"{100 * (1 - min(pattern_cells.values()) / size):.0f} % apart: a colour filter lies on this sensor. "
+                f"Say its pattern, such as {green}."
             )
         return
     greens, others = (crossed, straight) if pattern in ("RGGB", "BGGR") else (straight, crossed)
@@ -518,7 +518,7 @@ def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> No
             "GBRG": ("RGGB", "BGGR"),
         }[pattern]
         raise ValueError(
-            f"the two greens of {pattern} differ by {100 * greens:.0f} %, and its red and blue by {100 * others:.0f} %: "
+            f"the two greens of {pattern} differ by {100 * greens:.0f} %, its red and blue by {100 * others:.0f} %: "
             f"the colour filter is off by one pixel. Use pattern {column} (one column) or {row} (one row)."
         )
 

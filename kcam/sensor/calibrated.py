@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import TypedDict
 
 from kcam.context import Stage
 from kcam.plain import from_json
@@ -20,7 +20,6 @@ class _Quantity(TypedDict):
     value: float | None
     standard_error: float | None
     unit: str
-    reason: NotRequired[str]
 
 
 class _Channel(TypedDict):
