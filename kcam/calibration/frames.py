@@ -150,7 +150,7 @@ def exposure_time(path: str | os.PathLike[str]) -> float | None:
             with Image.open(path) as file:
                 exif = file.getexif()
                 told = exif.get_ifd(_EXIF).get(_EXPOSURE_TIME) or exif.get(_EXPOSURE_TIME)
-        except (OSError, ValueError, SyntaxError):
+        except Exception:  # of a damaged file Pillow may say anything
             return None  # what cannot be read says so when it is read as a frame
         return None if told is None else float(told)
     return None
