@@ -795,7 +795,7 @@ class _Transfer:
             return False
         times = np.array([level.time for level in self.darks], float)
         noise = np.array([unrounded(level.variance) for level in self.darks])
-        errors = np.array([2 * (level.variance**2) / (level.frames - 1) / level.pixels for level in self.darks])
+        errors = np.array([self._variance_error(level, self.slope, self.height) for level in self.darks])
         solved, covariance = _weighted(times, noise, errors)
         rate, error = float(solved[1]), math.sqrt(covariance[1, 1])
         slope, height, line = self._line(rate)
@@ -882,14 +882,20 @@ class _Transfer:
     def _below_black(self) -> str:
         return "the darks are cut off at 0 DN: raise the black level, so that less than 0.5 % of the pixels are 0"
 
+    def _tail(self, variance: float) -> float:
+        """How much of a variance the few dark pixels that are cut off at 0 may take away: 1.7 times their share at 0.5 %."""
+        return 2 * max(level.bottom for level in self.darks) * variance
+
     def _read_noise(self) -> Quantity:
         if self.cut:
             return _unknown("read_noise", self._below_black())
-        # what rounding hides is alike in all darks
+        # what rounding hides is alike in all darks, and what is cut off at 0 was the tail of the noise
         hidden = max(
             _hidden(self.height, self.height + max(d.spread - self.height / d.frames, 0.0)) for d in self.darks
         )
-        error = math.sqrt(self.covariance[0, 0] + (self.slope * self.black_error) ** 2 + hidden**2)
+        error = math.sqrt(
+            self.covariance[0, 0] + (self.slope * self.black_error) ** 2 + hidden**2 + self._tail(self.height) ** 2
+        )
         if max(d.variance for d in self.darks) < 0.24 and error > 0.5 * max(self.height, 0.0):
             most = 0.4 / self.slope
             return _unknown(
@@ -917,7 +923,9 @@ class _Transfer:
             )
         hidden = _hidden(temporal + spread, temporal + spread)
         variance = split.total - (1 / 12 - float(rounding_variance(temporal)))
-        return _known("dsnu", *self._per_electron(*root(variance, math.hypot(split.error, hidden))))
+        return _known(
+            "dsnu", *self._per_electron(*root(variance, math.hypot(split.error, hidden, self._tail(temporal + spread))))
+        )
 
     def _light(self, darks: list[_Sums], flats: list[_Sums]) -> tuple[_Split | None, np.ndarray]:
         """The pattern of the gain, relative to the even light."""

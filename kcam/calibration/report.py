@@ -157,7 +157,7 @@ def spatial_figure(pattern: Spatial, *, title: str, unit: str, scale: float = 1.
     axes.set(yscale="log", xlim=(0, 0.5), ylim=(min(low, high / 30), 1.5 * high))
     _key(axes, loc="upper right", ncols=2)
     axes = _panel(sheet, 1, 1, "Histogram, and the normal one of the same spread", x=unit, y="pixels")
-    counts, edges = np.histogram(image, bins=min(256, max(16, int(math.sqrt(image.size)))))
+    counts, edges = np.histogram(image, bins=_bins(image))
     middles, step = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
     normal = image.size * step / (spread * math.sqrt(2 * math.pi)) * np.exp(-0.5 * (middles / spread) ** 2)
     axes.stairs(counts, edges, color=INK, lw=1.0, label="pixels")
@@ -165,6 +165,16 @@ def spatial_figure(pattern: Spatial, *, title: str, unit: str, scale: float = 1.
     axes.set(yscale="log", ylim=(0.5, 2 * max(counts.max(), 1)))
     _key(axes, loc="upper right")
     return sheet.figure
+
+
+def _bins(image: np.ndarray) -> np.ndarray:
+    """Edges of a histogram, a whole number of the steps that rounded values have apart: none is empty between others."""
+    low, high = float(image.min()), float(image.max())
+    width = max(high - low, 1e-12) / min(128, max(16, int(math.sqrt(image.size))))
+    steps = np.diff(np.unique(np.round((image - low) / max(high - low, 1e-12), 9))) * (high - low)
+    if 0 < len(steps) < 1000:
+        width = math.ceil(width / steps.min()) * float(steps.min())
+    return low - width / 2 + width * np.arange(math.ceil((high - low) / width) + 2)
 
 
 def save_report(found: SensorCalibration, path: str | os.PathLike[str]) -> None:
