@@ -40,13 +40,15 @@ def draw(seed: int, *, pattern: str | None = None, clamp: bool = False, **given:
         "falloff": rng.choice([0.0, 0.2]),
         "brightest": 1.3,  # of saturation
         "bend": 0.0,  # relative loss at saturation
+        "late": False,  # whether the pixels' gains differ behind the well, so that dark electrons have a pattern too
     } | given
     size, gain, top = of["size"], of["gain"], 2 ** of["bits"] - 1
     black = of.get("black", math.ceil(6 * math.hypot(of["read_noise"], of["dsnu"]) * gain) + 16)
     well = of["well"] * (top - black) / gain
     saturation = min(well, (top - black) / gain)
     y, x = np.mgrid[-1 : 1 : size * 1j, -1 : 1 : size * 1j]
-    light = (1 - of["falloff"] * (x**2 + y**2)) * (1 + of["prnu"] * rng.standard_normal((size, size)))
+    light, gains = 1 - of["falloff"] * (x**2 + y**2), 1 + of["prnu"] * rng.standard_normal((size, size))
+    light, late = (light, gains) if of["late"] else (light * gains, np.ones_like(gains))
     offset = of["dsnu"] * rng.standard_normal((size, size))
     for place, letter in enumerate(pattern or ""):
         light[place // 2 :: 2, place % 2 :: 2] *= {"R": 0.6, "G": 1.0, "B": 0.75}[letter]
@@ -55,7 +57,7 @@ def draw(seed: int, *, pattern: str | None = None, clamp: bool = False, **given:
         expected = np.maximum(electrons * light, 0)
         expected = expected * (1 - of["bend"] * expected / saturation)
         counted = np.minimum(rng.poisson(expected + of["dark_current"] * time), well)
-        counted = counted + offset + of["read_noise"] * rng.standard_normal((size, size))
+        counted = counted * late + offset + of["read_noise"] * rng.standard_normal((size, size))
         taken_off = of["dark_current"] * time if clamp else 0.0
         return np.clip(np.rint(gain * (counted - taken_off) + black), 0, top).astype(np.uint16)
 

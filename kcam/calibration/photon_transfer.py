@@ -607,7 +607,9 @@ def photon_transfer(
             stack = flat_frames.read(index, survey.shape)
             for name in wanted:
                 patterns[name] = _added(patterns[name], survey.sums(stack, name))
-    channels = {name: t.result(survey.dark[name], patterns[name], notes=notes) for name, t in transfers.items()}
+    channels = {
+        name: t.result(t.shortest(survey.dark[name]), patterns[name], notes=notes) for name, t in transfers.items()
+    }
     black = float(np.mean([channel.black_level for channel in channels.values()]))
     return SensorCalibration(bits, black, pattern, channels, tuple(dict.fromkeys(notes)))
 
@@ -620,7 +622,7 @@ class _Survey:
     """What one look at all frames tells: the levels of each channel, and what the values are.
 
     highest, piled: the highest value, and the share of a level that stands there.  steps: what all values are multiples
-    of.  light: sum of the means above black by cell of 2 x 2 pixels.  dark: by channel, all darks added up.
+    of.  light: sum of the means above black by cell of 2 x 2 pixels.  dark: by channel, each level of darks added up.
     """
 
     def __init__(self, pattern: str | None) -> None:
@@ -629,7 +631,7 @@ class _Survey:
         self.shape: tuple[int, int] | None = None
         self.highest, self.piled, self.steps, self.black = 0.0, 0.0, 0, 0.0
         self.light = dict.fromkeys([(0, 0), (0, 1), (1, 0), (1, 1)], 0.0)
-        self.dark: dict[str, list[_Sums]] = {name: [] for name in self.cells}
+        self.dark: dict[str, list[list[_Sums]]] = {name: [] for name in self.cells}
         self.seen: dict[tuple[str, str], list[tuple[float, Level]]] = {}
 
     def planes(self, stack: np.ndarray, name: str) -> list[np.ndarray]:
@@ -663,7 +665,7 @@ class _Survey:
         for name in self.cells:
             planes, sums = self.planes(stack, name), self.sums(stack, name)
             if frames.what == "darks":
-                self.dark[name] = _added(self.dark[name], sums)
+                self.dark[name].append(sums)
             level = Level(
                 mean=float(np.mean([s.mean.mean() for s in sums])),
                 variance=float(np.mean([s.variance.mean() / s.frames for s in sums])),
@@ -692,7 +694,13 @@ class _Transfer:
     """
 
     def __init__(self, name: str, darks: list[Level], flats: list[Level], scale: float) -> None:
-        self.name, self.darks, self.scale = name, darks, scale
+        self.name, self.given, self.scale = name, darks, scale
+        self.darks = [d for d in darks if d.top <= 1e-3 and d.mean + 3 * math.sqrt(d.variance + d.spread) < scale]
+        if not self.darks:
+            raise ValueError(
+                f"all darks are saturated in {name}: their lowest mean is {min(d.mean for d in darks):.1f} DN. Did "
+                "light fall on the sensor? Cap the lens, and expose for 0.1 s or less."
+            )
         self.order = sorted(enumerate(flats), key=lambda item: item[1].mean)
         self.flats = [level for _, level in self.order]
         self.cut = max(level.bottom for level in darks) > _CUT
@@ -709,6 +717,16 @@ class _Transfer:
         inside = [(index, level) for (index, level), linear in zip(self.order, self.linear, strict=True) if linear]
         half = [i for i, level in inside if level.mean - self.black > 0.1 * (self.limit - self.black)]
         self.even = set(half or [index for index, _ in inside[-1:]])
+
+    def shortest(self, darks: list[list[_Sums]]) -> list[_Sums]:
+        """The darks whose pattern is the offsets' alone: in others that of the dark current comes in."""
+        least = min(self.darks, key=lambda level: level.mean if level.time is None else level.time)
+        found: list[_Sums] = []
+        for level, sums in zip(self.given, darks, strict=True):
+            alike = abs(level.mean - least.mean) < 4 * math.hypot(_mean_error(level), _mean_error(least))
+            if level is least or (level.time == least.time and alike):
+                found = _added(found, sums)
+        return found
 
     def _black(self) -> tuple[float, float, float, float]:
         """Mean without light at no time [DN], and the dark signal [DN / s], each with its error: NaN if unknown."""
@@ -798,10 +816,10 @@ class _Transfer:
         errors = np.array([self._variance_error(level, self.slope, self.height) for level in self.darks])
         solved, covariance = _weighted(times, noise, errors)
         rate, error = float(solved[1]), math.sqrt(covariance[1, 1])
-        slope, height, line = self._line(rate)
-        expected = slope * self.rate
-        if rate - expected < 5 * math.hypot(error, slope * self.rate_error) or expected > 0.2 * rate:
+        expected = self.slope * self.rate
+        if rate - expected < 5 * math.hypot(error, self.slope * self.rate_error) or expected > 0.2 * rate:
             return False
+        slope, height, line = self._line(rate)
         self.slope, self.height, self.covariance = slope, height, line
         self.variance_rate = (rate / slope, error / slope)
         return True
@@ -883,7 +901,7 @@ class _Transfer:
         return "the darks are cut off at 0 DN: raise the black level, so that less than 0.5 % of the pixels are 0"
 
     def _tail(self, variance: float) -> float:
-        """How much of a variance the few dark pixels that are cut off at 0 may take away: 1.7 times their share at 0.5 %."""
+        """What the few dark pixels that are cut off at 0 may take from a variance: 1.7 times their share at 0.5 %."""
         return 2 * max(level.bottom for level in self.darks) * variance
 
     def _read_noise(self) -> Quantity:
@@ -940,7 +958,11 @@ class _Transfer:
             smooth = np.maximum(smooth, 0.02 * smooth.mean())
             pattern = image / smooth - 1
             temporal = float(((flat.mean_variance + dark.mean_variance) / smooth**2).mean())
-            splits.append(_split(pattern, temporal=temporal, freedom=flat.freedom, fitted=order))
+            split = _split(pattern, temporal=temporal, freedom=flat.freedom, fitted=order)
+            if self.cut:  # then the darks show but a part of the offsets
+                hidden = 3 * float(dark.mean.var()) / float(smooth.mean()) ** 2
+                split = replace(split, error=math.hypot(split.error, hidden))
+            splits.append(split)
             maps.append(pattern)
         return (_pooled(splits), _shown(maps)) if splits else (None, np.empty((0, 0)))
 

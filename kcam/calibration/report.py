@@ -168,7 +168,7 @@ def spatial_figure(pattern: Spatial, *, title: str, unit: str, scale: float = 1.
 
 
 def _bins(image: np.ndarray) -> np.ndarray:
-    """Edges of a histogram, a whole number of the steps that rounded values have apart: none is empty between others."""
+    """Edges of a histogram, whole steps of the rounded values apart, so that none is empty between others."""
     low, high = float(image.min()), float(image.max())
     width = max(high - low, 1e-12) / min(128, max(16, int(math.sqrt(image.size))))
     steps = np.diff(np.unique(np.round((image - low) / max(high - low, 1e-12), 9))) * (high - low)

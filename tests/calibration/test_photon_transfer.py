@@ -58,6 +58,10 @@ def test_a_hundred_cameras_are_recovered_95_times_in_100() -> None:
     check_coverage(within_two_errors(range(1000, 1100)))
 
 
+def test_gains_behind_the_well_give_dark_electrons_a_pattern_that_is_no_dsnu() -> None:
+    check_coverage(within_two_errors(range(9), size=96, late=True, dark_current=90.0, levels=10))
+
+
 @pytest.mark.slow
 def test_noise_below_a_step_is_recovered_or_said_to_be_hidden() -> None:
     """Steps of 3 to 20 electrons and a read noise of 1 to 3."""
@@ -241,6 +245,7 @@ def spoilt(flats: np.ndarray, value: float) -> np.ndarray:
         ({"flats": GOOD.flats[3, :1]}, "flats: one frame is no pair"),
         ({"darks": GOOD.darks[:, :1]}, r"darks\[0\] is 1 frame: expected a pair"),
         ({"flats": GOOD.flats[-1:]}, "all flats are saturated in mono"),
+        ({"darks": GOOD.flats[-1:]}, "all darks are saturated in mono: their lowest mean is 4095.0 DN"),
         ({"flats": GOOD.darks[:1], "darks": GOOD.darks[:1]}, "the flats show no light in mono"),
         ({"flats": spoilt(GOOD.flats, math.nan)}, r"flats\[1\]\[0\] has 1 values that are NaN or inf"),
         ({"flats": spoilt(GOOD.flats, 7.5)}, r"flats\[1\]\[0\] has values that are no whole numbers, such as 7.5"),
