@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from kcam import __version__, memory
+from kcam.cli.calibration import calibrate_sensor
 from kcam.cli.console import complain, err, losses, one_line_errors, progress
 from kcam.cli.data import app as data_app
 
@@ -355,6 +356,9 @@ def calibrate() -> None:
         path = costs.save_rates(rates)
         typer.echo(f"predictions of single pictures are off by a factor of {off:.2f} in the median")
         typer.echo(path)
+
+
+app.command("calibrate-sensor")(calibrate_sensor)
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 from kcam.sensor.adc import ADC, quantise
 from kcam.sensor.banding import RowColumnNoise, fixed_stripes, row_column_noise
+from kcam.sensor.calibrated import from_calibration
 from kcam.sensor.colour_filter import ColourFilter, fit_gaussians
 from kcam.sensor.crosstalk import Crosstalk, crosstalk, crosstalk_kernel
 from kcam.sensor.defects import DefectPixels, defect_pixels
@@ -51,6 +52,7 @@ __all__ = [
     "fit_gaussians",
     "fixed_pattern",
     "fixed_stripes",
+    "from_calibration",
     "linearity_error",
     "microlens_response",
     "mosaic",
