@@ -1,0 +1,719 @@
+"""A lens from a picture of points or of a slanted edge: what trains in it, found by descent through the camera.
+
+    minimise over lens, places, levels:   chi^2 = sum_i (v_i - m_i)^2 / s_i^2,   s^2 = sigma_d^2 + K m
+
+m is what the lens's own PSF makes of points at unknown sub-pixel places, or of an edge at an unknown angle, with a
+brightness and a background each. The slope of chi^2 comes back through the optics by autograd, exactly; its curvature
+is that of Gauss and Newton, whose columns are differences of PSFs, and whose inverse is the covariance of the values.
+What a picture cannot tell has no standard error, and a fit from the other side finds what it can tell but for a sign.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import scipy
+import torch
+from torch import Tensor, nn
+
+from kcam import optics
+from kcam.calibration.targets import Targets, find_targets
+from kcam.inputs import describe
+from kcam.optics.elements.element import Element
+from kcam.optics.propagation.question import residual_path
+from kcam.units import as_numbers, check_length, check_pixel_pitch, wavelength_grid
+
+MOST_VALUES = 64  # that train
+_NOTICED = 0.1  # relative change of a PSF that makes the scale of a value
+_DIFFERENCE = 1e-3  # of the scale: steps of the differences that make columns
+_WIDE = 100.0  # scales: the prior, far beyond what a linear fit can say; it holds what the picture does not
+_UNSEEN = 20.0  # scales: a value known no better than this is not seen
+_STARTS, _STEPS = 8, 30
+_SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
+_MOST_SAMPLES = 1024  # along a PSF
+_NAMES = {
+    1: "piston", 2: "tilt x", 3: "tilt y", 4: "defocus", 5: "astigmatism 45", 6: "astigmatism 0", 7: "coma y",
+    8: "coma x", 9: "trefoil y", 10: "trefoil x", 11: "spherical",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PSFFit:
+    """A lens as a picture shows it: `fit_psf`.
+
+    lens: a copy with the values found. values, standard_errors: of each number that trained, by name: Zernike terms by
+        Noll's index, "Z4", in metres RMS; others as `named_parameters` calls them. covariance: (P, P) in that order.
+    ambiguous: names whose sign, or branch, the picture leaves open: `alternative` fits it as well.
+    unobservable: name -> why the picture does not tell it: the value is the one that was given, its error inf.
+    chi_squared: per degree of freedom; 1 where model and noise are right (and, of an estimated noise, always near).
+    places: (S, 3) of each target: picture, x, y [pixels]; of an edge picture, angle of the normal [rad], distance from
+        the picture's middle [pixels].
+
+    Example:
+    >>> given = optics.ZernikeAberration(torch.nn.Parameter(torch.zeros(8)))
+    >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), given, focus_distance=2.0)
+    >>> picture = lens.psf([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(33, 33)).detach()
+    >>> fit = kcam.calibration.fit_psf(picture, lens=lens, pixel_pitch=4 * um)
+    >>> sorted(fit.unobservable)[:3]  # piston, and tilts, which move a point as its place does
+    ['Z1', 'Z2', 'Z3']
+    """
+
+    lens: nn.Module
+    values: dict[str, float]
+    standard_errors: dict[str, float]
+    covariance: Tensor
+    ambiguous: tuple[str, ...]
+    alternative: dict[str, float] | None
+    unobservable: dict[str, str]
+    chi_squared: float
+    places: Tensor
+
+    def __str__(self) -> str:
+        lines = [f"chi^2 per degree of freedom {self.chi_squared:.3g}, {len(self.places)} targets"]
+        for name, value in self.values.items():
+            error = self.standard_errors[name]
+            words = [f"{name:>12} {value: .4e} +- {error:.1e}"]
+            if name.startswith("Z") and int(name[1:]) in _NAMES:
+                words.append(f"({_NAMES[int(name[1:])]})")
+            if name in self.ambiguous and self.alternative is not None:
+                words.append(f"or {self.alternative[name]:.4e}: the sign is ambiguous")
+            words += [f"not seen: {self.unobservable[name]}"] if name in self.unobservable else []
+            lines.append(" ".join(words))
+        return "\n".join(lines)
+
+
+def fit_psf(
+    picture: Tensor,
+    *,
+    lens: nn.Module,
+    pixel_pitch: float,
+    distances: Tensor | Sequence[float] | float | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    weights: Tensor | Sequence[float] | None = None,
+    defocus: Tensor | Sequence[float] | float = 0.0,
+    target: str = "auto",
+    points: Tensor | None = None,
+    full_well: float | None = None,
+    read_noise: float = 0.0,
+    fill_factor: float = 1.0,
+    upright: bool = True,
+) -> PSFFit:
+    """Find what trains in a lens from a picture of points or of a slanted edge.
+
+    Levenberg-Marquardt on chi^2, weighted by the noise, with its gradient by autograd through the lens, from several
+    starts; then from the twin that mirrors the wavefront, to learn whether a sign is open. All targets of a picture
+    share the lens; each has its own place, brightness and background. Windows are cut around targets, so light far
+    from them does not count.
+
+    **What a picture tells.** The even terms (defocus, astigmatism, spherical) have one joint sign that a single picture
+    leaves open: W(r) and -W(-r) have the same PSF. Two focuses, or a known defocus while none is fitted, settle it. An
+    edge shows the transfer function along its normal only: terms that do not act there are unobservable, and those that
+    mirror it keep their sign. Tilts move the picture like its unknown place, a piston does nothing.
+
+    Args:
+        picture: linear raw with black subtracted, (H,W), (1,H,W) or (N,1,H,W); N pictures of the same lens at N
+            focuses. Of a mosaic, one channel's pixels.
+        lens: `optics.Lens`, `optics.CompoundLens` or another with `psf`; its Parameters train and give the first
+            guess. It is not changed.
+        pixel_pitch: [m].  distances: of the targets [m], a number or (N,); None for the focus distance of the lens.
+        wavelengths, weights: (L,) [m], and the share of each in the picture; None for the focus wavelength, and for
+            equal shares.
+        defocus: how far the sensor stood behind where the lens has it, a number or (N,) [m]: known steps of focus.
+        target: "points", "edge", or "auto" to tell by the picture.
+        points: (K, 2) x and y about where points are [pixels]; None to find them.
+        full_well: electrons that the value 1.0 stands for (1.0 for a picture in electrons): then the noise is known,
+            with read_noise [electrons]. None: shot and read noise are estimated from what the fit leaves.
+        fill_factor: light-sensitive share of a pixel.
+        upright: the picture is as a camera shows it, turned by 180 degrees against the light on the sensor; False for
+            light as it falls, as `Lens.psf` gives it.
+    Returns:   a `PSFFit`.
+    Raises:    TypeError, ValueError for a picture that is no float tensor of these shapes, has NaN, is saturated (of
+               pixels at 1.0 in a picture in [0,1]), shows no target, or too small; an edge slanted by less than 1.5
+               degrees; a lens in which nothing trains, or more than 64 numbers; lengths that are not in metres.
+    Valid for isoplanatic pictures of a `Lens`; a `CompoundLens` has the PSF of each point's place, if the middle of the
+        picture is its axis. Standard errors are linear: of half a wave and more, trust several pictures rather.
+    Source:    Gonsalves, Phase retrieval and diversity in adaptive optics, Opt. Eng. 21 (1982) 829 (two focuses, the
+               sign); Press et al., Numerical Recipes, 3rd ed., 15.5 (Levenberg-Marquardt and its covariance).
+
+    Example:
+    >>> def lens(coma):  # Z8, nm RMS
+    ...     given = optics.ZernikeAberration(torch.nn.Parameter(torch.tensor([0.0] * 7 + [coma * nm])))
+    ...     return optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), given, focus_distance=2.0)
+    >>> seen = lens(40.0).psf([550 * nm], distances=2.0, pixel_pitch=3 * um, shape=(41, 41)).detach()
+    >>> round(kcam.calibration.fit_psf(seen, lens=lens(0.0), pixel_pitch=3 * um, upright=False).values["Z8"] / nm)
+    40
+    """
+    pictures = _checked(picture)
+    pitch = check_pixel_pitch(pixel_pitch)
+    bands = wavelength_grid([getattr(lens, "focus_wavelength", 550e-9)] if wavelengths is None else wavelengths)  # type: ignore[arg-type]
+    shares = _shares(weights, len(bands))
+    if target not in ("auto", "points", "edge"):
+        raise ValueError(f"target {target!r} is unknown; expected points, edge or auto.")
+    if full_well is not None and not full_well > 0 or not read_noise >= 0:
+        raise ValueError(f"full_well must be > 0 and read_noise >= 0 electrons, got {full_well} and {read_noise}.")
+    far = getattr(lens, "focus_distance", math.inf) if distances is None else distances
+    away = _each(far, len(pictures), name="distances")
+    steps = _each(defocus, len(pictures), name="defocus")
+    for step in steps.tolist():
+        check_length(abs(step), name="defocus", within=(0.0, 0.05), example="50 * um")
+    found = find_targets(pictures, kind=target, points=points)
+    _check_saturation(found)
+    optics_ = _Optics.of(lens, found, pitch, bands, shares, away, steps, upright, len(pictures), pictures.shape[-2:])
+    problem = _Problem(found, optics_, math.sqrt(fill_factor), upright)
+    noise = None if full_well is None else (read_noise**2 / full_well**2, 1 / full_well)
+    return _Fit(problem, noise).result(lens)
+
+
+# ---- what goes in ----------------------------------------------------------------------------------------------------
+
+
+def _checked(picture: Tensor) -> Tensor:
+    """(N,1,H,W) float64 on the CPU."""
+    if not isinstance(picture, Tensor) or not picture.is_floating_point():
+        raise TypeError(f"picture must be a floating-point tensor (N,1,H,W) of linear raw, got {describe(picture)}.")
+    shaped = picture.detach().double().cpu()
+    shaped = shaped[None, None] if shaped.ndim == 2 else shaped[None] if shaped.ndim == 3 else shaped
+    if shaped.ndim != 4 or shaped.shape[1] != 1 or shaped.numel() == 0:
+        raise ValueError(
+            f"picture has shape {tuple(picture.shape)}, expected (N,1,H,W): one channel, such as green, "
+            "picture[:, 1:2], and N pictures of one size."
+        )
+    if not bool(shaped.isfinite().all()):
+        count = int((~shaped.isfinite()).sum())
+        raise ValueError(f"picture has {count} values that are NaN or infinite. Cut the targets out without them.")
+    return shaped
+
+
+def _shares(weights: Tensor | Sequence[float] | None, count: int) -> Tensor:
+    if weights is None:
+        return torch.full((count,), 1 / count, dtype=torch.float64)
+    values = as_numbers(weights, name="weights", expected="one number per wavelength").detach().cpu()
+    if values.shape != (count,) or not bool((values >= 0).all()) or not float(values.sum()) > 0:
+        raise ValueError(f"weights must be {count} numbers >= 0, one per wavelength, not all 0, got {values.tolist()}.")
+    return values / values.sum()
+
+
+def _each(value: Any, count: int, *, name: str) -> Tensor:
+    """One number for each picture."""
+    values = as_numbers(value, name=name, expected="a number of metres, or one per picture").detach().cpu()
+    if values.numel() not in (1, count) or values.ndim > 1:
+        raise ValueError(f"{name} has {values.numel()} values, expected one, or one for each of {count} pictures.")
+    return values.reshape(-1).expand(count).clone()
+
+
+def _check_saturation(found: Targets) -> None:
+    for index, values in enumerate(found.values):
+        full = (values >= 1.0) & found.used[index]
+        if float(values.max()) == 1.0 and int(full.sum()) > 1:
+            x, y = found.origin[index].tolist()
+            raise ValueError(
+                f"{int(full.sum())} pixels of the target near x = {x:.0f}, y = {y:.0f} are at 1.0: saturated, so that "
+                "the shape of its peak is lost. Expose at most 0.8 of the full well."
+            )
+
+
+# ---- the lens --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Optics:
+    """Copies of the lens, one for each picture, as a function of the vector of all that trains."""
+
+    copies: list[Any]
+    shifts: list[float]
+    distances: list[float]
+    fields: list[Tensor | None]  # of the targets of each picture, where the PSF varies
+    which: Tensor  # (S,) PSF of each target
+    names: list[str]
+    start: Tensor
+    wavelengths: Tensor
+    shares: Tensor
+    pitch: float
+    step: float  # between samples [pixels]
+    samples: int
+
+    @classmethod
+    def of(
+        cls,
+        lens: nn.Module,
+        found: Targets,
+        pitch: float,
+        wavelengths: Tensor,
+        shares: Tensor,
+        distances: Tensor,
+        shifts: Tensor,
+        upright: bool,
+        count: int,
+        shape: Sequence[int],
+    ) -> _Optics:
+        if not callable(getattr(lens, "psf", None)):
+            raise TypeError(f"lens must be an optics.Lens or an optics.CompoundLens, got {type(lens).__name__}.")
+        names, values = _trained(lens)
+        copies = []
+        for shift in shifts.tolist():
+            own: Any = copy.deepcopy(lens).double().cpu()
+            if not any(p is own.sensor_distance for p in own.parameters()):
+                own.sensor_distance = own.sensor_distance + shift
+            copies.append(own)
+        finest = 0.9 * float(wavelengths.min()) * float(lens.f_number) / 2  # type: ignore[arg-type]
+        step = min(1.0, finest / pitch)
+        samples = 2 * math.ceil((1.5 if found.kind == "edge" else 1.0) * (found.reach + 2) / step) + 1
+        if samples > _MOST_SAMPLES:
+            raise ValueError(
+                f"PSFs {2 * found.reach:.0f} pixels wide of {pitch * 1e6:.3g} um at f/{float(lens.f_number):.3g} take "  # type: ignore[arg-type]
+                f"{samples} samples a side, more than {_MOST_SAMPLES}. Focus better, or cut the picture smaller."
+            )
+        fields: list[Tensor | None] = [None] * count
+        which = found.picture
+        if getattr(lens, "varies", False) and found.kind == "points":
+            middle = (torch.tensor([shape[1], shape[0]], dtype=torch.float64) - 1) / 2
+            places = (found.origin + found.start - middle) * (-pitch if upright else pitch)
+            fields = [
+                _field(own, places[found.picture == index], wavelengths, float(distances[index]))
+                for index, own in enumerate(copies)
+            ]
+            which = torch.empty_like(found.picture)
+            which[found.picture.argsort(stable=True)] = torch.arange(len(which))
+        return cls(
+            copies, shifts.tolist(), distances.tolist(), fields, which, names, values, wavelengths, shares, pitch,
+            step, samples,
+        )  # fmt: skip
+
+    def put(self, values: Tensor) -> None:
+        """Give the copies these values."""
+        for own, shift in zip(self.copies, self.shifts, strict=True):
+            _put(own, values, shift)
+
+    def bank(self, values: Tensor) -> Tensor:
+        """PSFs (Q, M, M) at these values, with a graph to `parameters`."""
+        self.put(values)
+        parts = []
+        for own, distance, field in zip(self.copies, self.distances, self.fields, strict=True):
+            asked: dict[str, Any] = {} if field is None else {"field": field}
+            found = own.psf(
+                self.wavelengths,
+                distances=distance,
+                pixel_pitch=self.pitch * self.step,
+                shape=(self.samples, self.samples),
+                integrate=False,
+                dtype=torch.float64,
+                **asked,
+            )
+            found = torch.einsum("...lyx,l->...yx", found, self.shares)
+            parts.append(found.flatten(0, -3))
+        return torch.cat(parts)
+
+    def slope(self, loss: Tensor) -> Tensor:
+        """d loss / d values (P,), through the lens."""
+        held = [p for own in self.copies for p in own.parameters() if p.requires_grad]
+        grads = torch.autograd.grad(loss, held, allow_unused=True)
+        flat = [torch.zeros_like(p).flatten() if g is None else g.flatten() for p, g in zip(held, grads, strict=True)]
+        return torch.cat(flat).view(len(self.copies), -1).sum(0)
+
+    @torch.no_grad()
+    def scales(self) -> Tensor:
+        """Change of each value that changes PSFs by a tenth, (P,); inf where nothing does."""
+        base = self.bank(self.start)
+
+        def change(index: int, by: float) -> float:
+            try:
+                moved = self.bank(self.start + by * _unit(index, len(self.start)))
+            except ValueError:
+                return math.inf
+            return float((moved - base).norm() / base.norm())
+
+        found = []
+        for index in range(len(self.start)):
+            low, high = math.nan, math.inf
+            for power in range(-12, 3):
+                if change(index, 10.0**power) > _NOTICED:
+                    low, high = 10.0 ** (power - 1), 10.0**power
+                    break
+            for _ in range(5 if high < math.inf else 0):
+                middle = math.sqrt(low * high)
+                low, high = (low, middle) if change(index, middle) > _NOTICED else (middle, high)
+            found.append(high)
+        return torch.tensor(found, dtype=torch.float64)
+
+    @torch.no_grad()
+    def wavefront(self, values: Tensor) -> Tensor | None:
+        """Residual path over the pupil of the first picture, (n, n) [m], NaN outside; None where the lens has none."""
+        self.put(values)
+        own, side = self.copies[0], torch.linspace(-1, 1, 33, dtype=torch.float64)
+        middle = self.wavelengths[[len(self.wavelengths) // 2]]
+        if isinstance(own, optics.Lens):
+            query = own.query(middle, distances=self.distances[0], pixel_pitch=1e-6, shape=(1, 1))
+            coefficients, maps = residual_path(query, query.pupil(side[None, :], side[:, None]))
+            found = torch.einsum("t,tyx->yx", coefficients[0, 0], maps)
+            return found.masked_fill(side[None, :] ** 2 + side[:, None] ** 2 > 1, math.nan) if own.round else found
+        if isinstance(own, optics.CompoundLens):
+            waves, passes = own.opd(middle, distances=self.distances[0], samples=33)
+            return (waves[0, 0] * middle).masked_fill(~passes[0, 0], math.nan)
+        return None
+
+
+def _unit(index: int, count: int) -> Tensor:
+    return torch.nn.functional.one_hot(torch.tensor(index), count).double()
+
+
+def _trained(lens: nn.Module) -> tuple[list[str], Tensor]:
+    """Names and values of what trains."""
+    zernikes = [name for name, part in lens.named_modules() if isinstance(part, optics.ZernikeAberration)]
+    names, values = [], []
+    for name, parameter in lens.named_parameters():
+        if not parameter.requires_grad:
+            continue
+        if parameter.numel() > MOST_VALUES:
+            raise ValueError(f"{name} has {parameter.numel()} numbers that train, more than {MOST_VALUES}: use Zernikes.")
+        values.append(parameter.detach().double().cpu().flatten())
+        owner = name.rpartition(".")[0]
+        if owner in zernikes:
+            prefix = "Z" if len(zernikes) == 1 else f"{owner}.Z"
+            names += [f"{prefix}{j + 1}" for j in range(parameter.numel())]
+        else:
+            names += [name] if parameter.ndim == 0 else [f"{name}[{k}]" for k in range(parameter.numel())]
+    if not names:
+        raise ValueError(
+            "nothing trains in this lens: make what is to be found a Parameter, such as "
+            "optics.ZernikeAberration(nn.Parameter(torch.zeros(11))) or Surface(thickness=nn.Parameter(...))."
+        )
+    if len(names) > MOST_VALUES:
+        raise ValueError(f"{len(names)} numbers of the lens train, more than {MOST_VALUES}: p.requires_grad_(False).")
+    return names, torch.cat(values)
+
+
+def _put(lens: nn.Module, values: Tensor, shift: float) -> None:
+    """Give a lens the values of all that trains."""
+    first = 0
+    for name, parameter in lens.named_parameters():
+        if parameter.requires_grad:
+            own = values[first : first + parameter.numel()].view_as(parameter)
+            parameter.data.copy_(own + shift if name == "sensor_distance" else own)
+            first += parameter.numel()
+
+
+@torch.no_grad()
+def _field(lens: Any, places: Tensor, wavelengths: Tensor, distance: float) -> Tensor:
+    """Object points (F, 2) whose chief rays fall at places (F, 2) [m]."""
+    field = -places / lens.image_scale
+    radius = places.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    middle = wavelengths[[len(wavelengths) // 2]]
+    for _ in range(5):
+        fallen = lens.image_point(middle, distances=distance, field=field)[:, 0, 0].norm(dim=1, keepdim=True)
+        field = field * torch.where(fallen > 1e-9, radius / fallen.clamp(min=1e-12), 1.0)
+    return field
+
+
+# ---- the fit ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _State:
+    """Values (P,), places (S, 2) and what they leave."""
+
+    values: Tensor
+    places: Tensor
+    cost: float
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """chi^2 of the targets as a function of the lens and of places; levels are solved for."""
+
+    targets: Targets
+    optics: _Optics
+    width: float
+    upright: bool
+
+    def shapes(self, bank: Tensor, places: Tensor) -> Tensor:
+        """(..., S, n)."""
+        how = {"step": self.optics.step, "width": self.width, "upright": self.upright}
+        return self.targets.shapes(bank, self.optics.which, places, **how)  # type: ignore[arg-type]
+
+    def levels(self, shape: Tensor, weight: Tensor) -> Tensor:
+        """Brightness and background of each target (S, 2), by least squares."""
+        columns = torch.stack([shape.detach(), torch.ones_like(shape)], dim=-1)
+        normal = torch.einsum("snk,sn,snl->skl", columns, weight, columns)
+        right = torch.einsum("snk,sn,sn->sk", columns, weight, self.targets.values)
+        return torch.linalg.lstsq(normal, right[..., None]).solution[..., 0]
+
+    def model(self, bank: Tensor, places: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """What the pixels should be (S, n), and the levels."""
+        shape = self.shapes(bank, places)
+        levels = self.levels(shape, weight)
+        return levels[:, 0, None] * shape + levels[:, 1, None], levels
+
+
+@dataclass
+class _Fit:
+    """The search, with the noise that it knows."""
+
+    problem: _Problem
+    noise: tuple[float, float] | None  # variance = first + second * value
+
+    def result(self, lens: nn.Module) -> PSFFit:
+        """All of it."""
+        optics_, targets = self.problem.optics, self.problem.targets
+        scales = optics_.scales()
+        self.free = torch.nonzero(scales.isfinite()).flatten()
+        self.scales = torch.where(scales.isfinite(), scales, 1.0)
+        self.weight = self._first_weight()
+        best, others = self._search()
+        for _ in range(3):
+            self.weight = self._weight_at(best)
+            best = self._descend(best)
+        rivals = [self._descend(start) for start in (*self._twins(best), *others)]
+        better = min(rivals, key=lambda state: state.cost, default=best)
+        if better.cost < best.cost - 1e-3:
+            rivals.append(best)
+            best = better
+        covariance = self._covariance(best)
+        errors = covariance.diagonal().sqrt()
+        unseen = self._unseen(errors, scales)
+        rival = self._rival(best, rivals, covariance)
+        seen = [name for name in optics_.names if name not in unseen]
+        start = torch.tensor([name in unseen for name in optics_.names])
+        values = torch.where(start, optics_.start, best.values)
+        fitted = copy.deepcopy(lens)
+        _put(fitted, values, 0.0)
+        apart = torch.zeros_like(values) if rival is None else (rival.values - best.values).abs() / errors
+        ambiguous = tuple(n for n, a in zip(optics_.names, apart.tolist(), strict=True) if a > 2 and n not in unseen)
+        freedom = int(targets.used.sum()) - len(seen) - 4 * len(targets.values)
+        edge = targets.kind == "edge"
+        places = best.places if edge else best.places + targets.origin
+        listed = dict(zip(optics_.names, values.tolist(), strict=True))
+        return PSFFit(
+            fitted,
+            listed,
+            {n: math.inf if n in unseen else e for n, e in zip(optics_.names, errors.tolist(), strict=True)},
+            covariance,
+            ambiguous,
+            {n: float(v) for n, v in zip(optics_.names, rival.values, strict=True)} if rival and ambiguous else None,
+            unseen,
+            best.cost / max(freedom, 1),
+            torch.cat([targets.picture[:, None].double(), places], dim=1),
+        )
+
+    # -- noise
+
+    def _first_weight(self) -> Tensor:
+        values, used = self.problem.targets.values, self.problem.targets.used
+        if self.noise is not None:
+            first, second = self.noise
+            floor = max(first, 1e-2 * second * float(values.max()))  # of what is noise itself
+            return used / (first + second * values).clamp(min=floor)
+        spread = (values - values.mean(1, keepdim=True))[used].square().mean()
+        return used / (1e-4 * spread).expand_as(values)
+
+    @torch.no_grad()
+    def _weight_at(self, state: _State) -> Tensor:
+        """1 / variance at the model, of known noise or of what is left."""
+        targets = self.problem.targets
+        model, _ = self.problem.model(self.problem.optics.bank(state.values), state.places, self.weight)
+        light = model.clamp(min=0)
+        peak = float(light.max())
+        if self.noise is None:
+            first, second = _line(light[targets.used], (targets.values - model)[targets.used] ** 2)
+        else:
+            first, second = self.noise
+        return targets.used / (first + second * light).clamp(min=max(1e-14 * peak**2, 1e-4 * second * peak))
+
+    # -- descent
+
+    def _prior(self, values: Tensor) -> Tensor:
+        return (values - self.problem.optics.start) / (_WIDE * self.scales)
+
+    @torch.no_grad()
+    def _cost(self, values: Tensor, places: Tensor) -> float:
+        try:
+            model, _ = self.problem.model(self.problem.optics.bank(values), places, self.weight)
+        except ValueError:  # no such lens
+            return math.inf
+        left = (self.problem.targets.values - model).square() * self.weight
+        return float(left.sum() + self._prior(values).square().sum())
+
+    def _normal(self, state: _State) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Of the values (P, P), with the targets' own (S, P, 4), of these (S, 4, 4); slopes (P,), (S, 4)."""
+        problem, optics_ = self.problem, self.problem.optics
+        graph = optics_.bank(state.values)
+        model, levels = problem.model(graph, state.places, self.weight)
+        left = problem.targets.values - model
+        slope = optics_.slope((left.square() * self.weight).sum())
+        bank, left = graph.detach(), left.detach()
+        with torch.no_grad():
+            shape = problem.shapes(bank, state.places)
+            steps = _DIFFERENCE * self.scales
+            moved = [optics_.bank(state.values + steps[p] * _unit(p, len(steps))) - bank for p in self.free.tolist()]
+            columns = problem.shapes(torch.stack(moved) / steps[self.free, None, None, None], state.places)
+            columns = columns * levels[:, 0, None]
+        one = torch.ones_like(state.places)
+        tangents = [
+            torch.func.jvp(lambda at: problem.shapes(bank, at), (state.places,), (one * torch.eye(2).double()[k],))[1]
+            for k in range(2)
+        ]
+        own = torch.stack([*(levels[:, 0, None] * t for t in tangents), shape, torch.ones_like(shape)], dim=-1)
+        weighted = own * self.weight[..., None]
+        within = torch.einsum("snk,snl->skl", weighted, own)
+        between = torch.einsum("psn,snk->spk", columns, weighted)
+        flat = (columns * self.weight.sqrt()).flatten(1)
+        across = flat @ flat.T + torch.diag((_WIDE * self.scales[self.free]) ** -2)
+        prior = self._prior(state.values) / (_WIDE * self.scales)
+        own_slope = torch.einsum("snk,sn->sk", weighted, left)
+        return across, between, within, (-slope / 2 - prior)[self.free], own_slope
+
+    def _descend(self, state: _State, *, most: int = _STEPS) -> _State:
+        """Down to where a step changes chi^2 no more."""
+        state = replace(state, cost=self._cost(state.values, state.places))
+        freedom, damping = int(self.problem.targets.used.sum()), 1e-3
+        for _ in range(most):
+            across, between, within, slope, own_slope = self._normal(state)
+            while damping < 1e8:
+                step, own_step = _solve(across, between, within, slope, own_slope, damping)
+                values = state.values.index_add(0, self.free, step)
+                places = state.places + own_step[:, :2].clamp(-2, 2)
+                cost = self._cost(values, places)
+                if cost < state.cost:
+                    break
+                damping *= 8
+            else:
+                return state
+            gained, state = state.cost - cost, _State(values, places, cost)
+            damping = max(damping / 10, 1e-9)
+            if gained < 1e-4 * max(1.0, cost / freedom):
+                return state
+        return state
+
+    def _search(self) -> tuple[_State, list[_State]]:
+        """The best of several starts, and others that end about as low."""
+        optics_, targets = self.problem.optics, self.problem.targets
+        seeded = torch.Generator().manual_seed(0)
+        ends: list[_State] = []
+        for index in range(_STARTS):
+            size = 0.3 if index == 0 else 1 + index % 4
+            away = size * (2 * torch.rand(len(self.scales), generator=seeded, dtype=torch.float64) - 1)
+            values = optics_.start + torch.zeros_like(away).index_add(0, self.free, (away * self.scales)[self.free])
+            ends.append(self._descend(_State(values, targets.start, math.inf)))
+            lowest = min(end.cost for end in ends)
+            if index >= 1 and sum(end.cost < lowest + self._close(lowest) for end in ends) > 1:
+                break
+        ends.sort(key=lambda end: end.cost)
+        return ends[0], [end for end in ends[1:] if end.cost < ends[0].cost + self._close(ends[0].cost)]
+
+    def _close(self, cost: float) -> float:
+        """Difference of chi^2 between fits that may be equally good, before the noise is known."""
+        freedom = int(self.problem.targets.used.sum())
+        return _SAME_FIT * max(1.0, cost / freedom)
+
+    # -- what it means
+
+    def _covariance(self, state: _State) -> Tensor:
+        across, between, within, _, _ = self._normal(state)
+        inside = torch.linalg.inv(_schur(across, between, within))
+        whole = torch.diag((_WIDE * self.scales) ** 2)
+        whole[self.free[:, None], self.free] = inside
+        return whole
+
+    def _unseen(self, errors: Tensor, scales: Tensor) -> dict[str, str]:
+        found = {}
+        for name, error, scale in zip(self.problem.optics.names, errors.tolist(), scales.tolist(), strict=True):
+            if math.isinf(scale):
+                found[name] = "no picture changes with it"
+            elif not error < _UNSEEN * scale:
+                found[name] = (
+                    "to first order this picture does not change with it, or as it does with a place, a level or "
+                    "another value that trains; a second focus, or an edge of another orientation, may show it"
+                )
+        return found
+
+    def _twins(self, state: _State) -> Iterator[_State]:
+        """Where the wavefront is as another one that has the same PSF, or the same edge."""
+        own = self.problem.optics.wavefront(state.values)
+        if own is None:
+            return
+
+        def turned(path: Tensor) -> Tensor:
+            return -path.flip(0, 1)
+
+        ways: list[Callable[[Tensor], Tensor]] = [turned]
+        if self.problem.targets.kind == "edge":
+            angle = float(state.places[0, 0])
+            ways += [lambda path: _mirrored(path, angle), lambda path: -_mirrored(path, angle).flip(0, 1)]
+        for way in ways:
+            values = self._with_wavefront(state.values, way(own))
+            if values is not None and bool((values - state.values).abs().gt(1e-3 * self.scales).any()):
+                yield _State(values, state.places, math.inf)
+
+    def _with_wavefront(self, values: Tensor, wanted: Tensor) -> Tensor | None:
+        """Values whose wavefront comes closest to one, up to a piston and tilts."""
+        side = torch.linspace(-1, 1, wanted.shape[-1], dtype=torch.float64)
+        plane = [torch.ones_like(wanted), side[None, :].expand_as(wanted), side[:, None].expand_as(wanted)]
+        for _ in range(3):
+            try:
+                now = self.problem.optics.wavefront(values)
+                units = [s * _unit(p, len(values)) for p, s in enumerate(self.scales.tolist())]
+                moved = [self.problem.optics.wavefront(values + units[p]) for p in self.free.tolist()]
+            except ValueError:
+                return None
+            columns = torch.stack([*(m - now for m in moved), *(1e-7 * part for part in plane)])  # type: ignore[operator]
+            known = columns.isfinite().all(0) & wanted.isfinite()
+            solved = scipy.linalg.lstsq(columns[:, known].T.numpy(), (wanted - now)[known].numpy(), cond=1e-6)[0]
+            step = torch.from_numpy(solved)[: len(self.free)] * self.scales[self.free]
+            values = values.index_add(0, self.free, step)
+        return values
+
+    def _rival(self, best: _State, rivals: list[_State], covariance: Tensor) -> _State | None:
+        """The closest of the fits that are as good, and others."""
+        information = torch.linalg.inv(covariance[self.free[:, None], self.free])
+
+        def apart(state: _State) -> float:
+            by = (state.values - best.values)[self.free]
+            return float(by @ information @ by)
+
+        equal = [state for state in rivals if state.cost < best.cost + _SAME_FIT and apart(state) > _SAME_FIT]
+        return min(equal, key=lambda state: state.cost, default=None)
+
+
+def _schur(across: Tensor, between: Tensor, within: Tensor) -> Tensor:
+    """What the targets leave to the values, (P, P)."""
+    return across - torch.einsum("spk,sqk->pq", between @ torch.linalg.inv(within), between)
+
+
+def _solve(
+    across: Tensor, between: Tensor, within: Tensor, slope: Tensor, own_slope: Tensor, damping: float
+) -> tuple[Tensor, Tensor]:
+    """A damped step of the values (P,) and of the targets' own (S, 4), who are eliminated first."""
+    across = across + damping * torch.diag(across.diagonal())
+    within = within + damping * torch.diag_embed(within.diagonal(dim1=-2, dim2=-1))
+    inverse = torch.linalg.inv(within)
+    right = slope - torch.einsum("spk,skl,sl->p", between, inverse, own_slope)
+    step = torch.linalg.solve(_schur(across, between, within), right)
+    return step, torch.einsum("skl,sl->sk", inverse, own_slope - torch.einsum("spk,p->sk", between, step))
+
+
+def _line(light: Tensor, squares: Tensor) -> tuple[float, float]:
+    """Variance at no light, >= 0, and its rise with light, >= 0, from the squares of what a fit leaves."""
+    first, second = float(squares.mean()), 0.0
+    columns = torch.stack([torch.ones_like(light), light], dim=1)
+    least = 1e-14 * float(light.max()) ** 2
+    for _ in range(10):
+        weight = 1 / (first + second * light).clamp(min=max(least, 1e-3 * second * float(light.max())))
+        solved, _ = scipy.optimize.nnls((columns * weight[:, None]).numpy(), (squares * weight).numpy())
+        first, second = (float(part) for part in solved)
+    return first, second
+
+
+def _mirrored(path: Tensor, angle: float) -> Tensor:
+    """A map over the pupil, mirrored in the line through its middle at an angle."""
+    side = torch.linspace(-1, 1, path.shape[-1], dtype=torch.float64)
+    x, y = side[None, :], side[:, None]
+    cos, sin = math.cos(2 * angle), math.sin(2 * angle)
+    grid = torch.stack([x * cos + y * sin, x * sin - y * cos], dim=-1)
+    found = torch.nn.functional.grid_sample(
+        path.nan_to_num()[None, None], grid[None], mode="bicubic", align_corners=True
+    )[0, 0]
+    inside = (x**2 + y**2 < 0.85) if bool(path.isnan().any()) else torch.ones_like(path, dtype=torch.bool)
+    return found.masked_fill(~inside, math.nan)
