@@ -30,9 +30,12 @@ from kcam.units import as_numbers, check_length, check_pixel_pitch, wavelength_g
 MOST_VALUES = 64  # that train
 _NOTICED = 0.1  # relative change of a PSF that makes the scale of a value
 _DIFFERENCE = 1e-3  # of the scale: steps of the differences that make columns
-_WIDE = 100.0  # scales: the prior, far beyond what a linear fit can say; it holds what the picture does not
-_UNSEEN = 20.0  # scales: a value known no better than this is not seen
+_PLACE_STEP = 1e-4  # pixels, or radians: of central ones
+_WIDE = 25.0  # scales: the prior, far beyond what a linear fit can say; it holds what the picture does not
+_UNSEEN = 5.0  # scales: a value known no better than this is not seen
+_CLOSE = 1.0  # scales: the prior of what is not seen, once that is known
 _STARTS, _STEPS = 8, 30
+_SCAN = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # scales
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
 _MOST_SAMPLES = 1024  # along a PSF
 _NAMES = {
@@ -48,7 +51,8 @@ class PSFFit:
     lens: a copy with the values found. values, standard_errors: of each number that trained, by name: Zernike terms by
         Noll's index, "Z4", in metres RMS; others as `named_parameters` calls them. covariance: (P, P) in that order.
     ambiguous: names whose sign, or branch, the picture leaves open: `alternative` fits it as well.
-    unobservable: name -> why the picture does not tell it: the value is the one that was given, its error inf.
+    unobservable: name -> why the picture does not tell it. Its error is inf, its value that of the fit nearest to the
+        lens that was given, so that `lens` still makes the picture.
     chi_squared: per degree of freedom; 1 where model and noise are right (and, of an estimated noise, always near).
     places: (S, 3) of each target: picture, x, y [pixels]; of an edge picture, angle of the normal [rad], distance from
         the picture's middle [pixels].
@@ -461,6 +465,7 @@ class _Fit:
         scales = optics_.scales()
         self.free = torch.nonzero(scales.isfinite()).flatten()
         self.scales = torch.where(scales.isfinite(), scales, 1.0)
+        self.wide = torch.full_like(scales, _WIDE)
         self.weight = self._first_weight()
         best, others = self._search()
         for _ in range(3):
@@ -475,24 +480,23 @@ class _Fit:
         errors = covariance.diagonal().sqrt()
         unseen = self._unseen(errors, scales)
         rival = self._rival(best, rivals, covariance)
-        seen = [name for name in optics_.names if name not in unseen]
-        start = torch.tensor([name in unseen for name in optics_.names])
-        values = torch.where(start, optics_.start, best.values)
+        apart = torch.zeros_like(errors) if rival is None else (rival.values - best.values).abs() / errors
+        names = optics_.names
+        ambiguous = tuple(n for n, a in zip(names, apart.tolist(), strict=True) if a > 2 and n not in unseen)
+        if unseen:  # of all fits that are as good, the one nearest to the lens that was given
+            self.wide = torch.tensor([_CLOSE if name in unseen else _WIDE for name in names], dtype=torch.float64)
+            best = self._descend(best)
         fitted = copy.deepcopy(lens)
-        _put(fitted, values, 0.0)
-        apart = torch.zeros_like(values) if rival is None else (rival.values - best.values).abs() / errors
-        ambiguous = tuple(n for n, a in zip(optics_.names, apart.tolist(), strict=True) if a > 2 and n not in unseen)
-        freedom = int(targets.used.sum()) - len(seen) - 4 * len(targets.values)
-        edge = targets.kind == "edge"
-        places = best.places if edge else best.places + targets.origin
-        listed = dict(zip(optics_.names, values.tolist(), strict=True))
+        _put(fitted, best.values, 0.0)
+        freedom = int(targets.used.sum()) - (len(names) - len(unseen)) - 4 * len(targets.values)
+        places = best.places if targets.kind == "edge" else best.places + targets.origin
         return PSFFit(
             fitted,
-            listed,
-            {n: math.inf if n in unseen else e for n, e in zip(optics_.names, errors.tolist(), strict=True)},
+            dict(zip(names, best.values.tolist(), strict=True)),
+            {n: math.inf if n in unseen else e for n, e in zip(names, errors.tolist(), strict=True)},
             covariance,
             ambiguous,
-            {n: float(v) for n, v in zip(optics_.names, rival.values, strict=True)} if rival and ambiguous else None,
+            dict(zip(names, rival.values.tolist(), strict=True)) if rival is not None and ambiguous else None,
             unseen,
             best.cost / max(freedom, 1),
             torch.cat([targets.picture[:, None].double(), places], dim=1),
@@ -525,7 +529,7 @@ class _Fit:
     # -- descent
 
     def _prior(self, values: Tensor) -> Tensor:
-        return (values - self.problem.optics.start) / (_WIDE * self.scales)
+        return (values - self.problem.optics.start) / (self.wide * self.scales)
 
     @torch.no_grad()
     def _cost(self, values: Tensor, places: Tensor) -> float:
@@ -550,26 +554,25 @@ class _Fit:
             moved = [optics_.bank(state.values + steps[p] * _unit(p, len(steps))) - bank for p in self.free.tolist()]
             columns = problem.shapes(torch.stack(moved) / steps[self.free, None, None, None], state.places)
             columns = columns * levels[:, 0, None]
-        one = torch.ones_like(state.places)
-        tangents = [
-            torch.func.jvp(lambda at: problem.shapes(bank, at), (state.places,), (one * torch.eye(2).double()[k],))[1]
-            for k in range(2)
-        ]
+            tangents = []
+            for along in _PLACE_STEP * torch.eye(2, dtype=torch.float64):
+                ahead, behind = (problem.shapes(bank, state.places + by) for by in (along, -along))
+                tangents.append((ahead - behind) / (2 * _PLACE_STEP))
         own = torch.stack([*(levels[:, 0, None] * t for t in tangents), shape, torch.ones_like(shape)], dim=-1)
         weighted = own * self.weight[..., None]
         within = torch.einsum("snk,snl->skl", weighted, own)
         between = torch.einsum("psn,snk->spk", columns, weighted)
         flat = (columns * self.weight.sqrt()).flatten(1)
-        across = flat @ flat.T + torch.diag((_WIDE * self.scales[self.free]) ** -2)
-        prior = self._prior(state.values) / (_WIDE * self.scales)
+        across = flat @ flat.T + torch.diag((self.wide * self.scales)[self.free] ** -2)
+        prior = self._prior(state.values) / (self.wide * self.scales)
         own_slope = torch.einsum("snk,sn->sk", weighted, left)
         return across, between, within, (-slope / 2 - prior)[self.free], own_slope
 
-    def _descend(self, state: _State, *, most: int = _STEPS) -> _State:
-        """Down to where a step changes chi^2 no more."""
+    def _descend(self, state: _State, *, until: float = 1e-4) -> _State:
+        """Down to where a step gains less of chi^2 than this."""
         state = replace(state, cost=self._cost(state.values, state.places))
         freedom, damping = int(self.problem.targets.used.sum()), 1e-3
-        for _ in range(most):
+        for _ in range(_STEPS):
             across, between, within, slope, own_slope = self._normal(state)
             while damping < 1e8:
                 step, own_step = _solve(across, between, within, slope, own_slope, damping)
@@ -583,25 +586,36 @@ class _Fit:
                 return state
             gained, state = state.cost - cost, _State(values, places, cost)
             damping = max(damping / 10, 1e-9)
-            if gained < 1e-4 * max(1.0, cost / freedom):
+            if gained < until * max(1.0, cost / freedom):
                 return state
         return state
 
     def _search(self) -> tuple[_State, list[_State]]:
         """The best of several starts, and others that end about as low."""
-        optics_, targets = self.problem.optics, self.problem.targets
-        seeded = torch.Generator().manual_seed(0)
+        targets, seeded = self.problem.targets, torch.Generator().manual_seed(0)
+        first = self._scanned()
         ends: list[_State] = []
         for index in range(_STARTS):
-            size = 0.3 if index == 0 else 1 + index % 4
-            away = size * (2 * torch.rand(len(self.scales), generator=seeded, dtype=torch.float64) - 1)
-            values = optics_.start + torch.zeros_like(away).index_add(0, self.free, (away * self.scales)[self.free])
-            ends.append(self._descend(_State(values, targets.start, math.inf)))
+            away = torch.randn(len(self.free), generator=seeded, dtype=torch.float64) * (0.3 if index == 0 else index)
+            values = first.index_add(0, self.free, away * self.scales[self.free])
+            ends.append(self._descend(_State(values, targets.start, math.inf), until=0.1))
             lowest = min(end.cost for end in ends)
-            if index >= 1 and sum(end.cost < lowest + self._close(lowest) for end in ends) > 1:
+            if sum(end.cost < lowest + self._close(lowest) for end in ends) > 1:
                 break
         ends.sort(key=lambda end: end.cost)
         return ends[0], [end for end in ends[1:] if end.cost < ends[0].cost + self._close(ends[0].cost)]
+
+    def _scanned(self) -> Tensor:
+        """Values that are better than those given, one after the other, by steps of many sizes."""
+        values, places = self.problem.optics.start, self.problem.targets.start
+        lowest = self._cost(values, places)
+        for index in self.free.tolist():
+            by = self.scales[index] * _unit(index, len(values))
+            tried = [(self._cost(values + size * by, places), size) for size in _SCAN]
+            cost, size = min(tried)
+            if cost < lowest:
+                lowest, values = cost, values + size * by
+        return values
 
     def _close(self, cost: float) -> float:
         """Difference of chi^2 between fits that may be equally good, before the noise is known."""
@@ -613,7 +627,7 @@ class _Fit:
     def _covariance(self, state: _State) -> Tensor:
         across, between, within, _, _ = self._normal(state)
         inside = torch.linalg.inv(_schur(across, between, within))
-        whole = torch.diag((_WIDE * self.scales) ** 2)
+        whole = torch.diag((self.wide * self.scales) ** 2)
         whole[self.free[:, None], self.free] = inside
         return whole
 
