@@ -35,7 +35,8 @@ _WIDE = 25.0  # scales: the prior, far beyond what a linear fit can say; it hold
 _UNSEEN = 5.0  # scales: a value known no better than this is not seen
 _CLOSE = 1.0  # scales: the prior of what is not seen, once that is known
 _STARTS, _STEPS = 8, 30
-_SCAN = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # scales
+_SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
+_FEW = 3  # values, which are scanned closely: blurs of defocus agree within a tenth of it only
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
 _MOST_SAMPLES = 1024  # along a PSF
 _NAMES = {
@@ -609,9 +610,11 @@ class _Fit:
         """Values that are better than those given, one after the other, by steps of many sizes."""
         values, places = self.problem.optics.start, self.problem.targets.start
         lowest = self._cost(values, places)
+        count = 20 if len(self.free) <= _FEW else 4
+        sizes = torch.logspace(*(math.log10(end) for end in _SCAN), count).tolist()
         for index in self.free.tolist():
             by = self.scales[index] * _unit(index, len(values))
-            tried = [(self._cost(values + size * by, places), size) for size in _SCAN]
+            tried = [(self._cost(values + size * by, places), size) for size in (*sizes, *(-size for size in sizes))]
             cost, size = min(tried)
             if cost < lowest:
                 lowest, values = cost, values + size * by
