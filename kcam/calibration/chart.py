@@ -25,7 +25,7 @@ _MIDDLE = 0.5  # of a patch's width: what is averaged
 _FEWEST = 4  # pixels of a channel in a patch
 _SATURATED = 0.01  # share of a patch's pixels
 _UNEVEN, _DARK = 0.2, 0.03  # spread in a patch: of its own mean, and of the brightest patch
-_SMOOTH = 3e-3  # weight of the second differences of a sensitivity
+_SMOOTH = 3e-4  # weight of the second differences of a sensitivity
 _FOLDS = 6
 _EPSILON = 1e-12
 
