@@ -34,9 +34,10 @@ _PLACE_STEP = 1e-4  # pixels, or radians: of central ones
 _WIDE = 25.0  # scales: the prior, far beyond what a linear fit can say; it holds what the picture does not
 _UNSEEN = 5.0  # scales: a value known no better than this is not seen
 _CLOSE = 1.0  # scales: the prior of what is not seen, once that is known
-_STARTS, _STEPS = 8, 30
+_STARTS, _STEPS, _MENDED = 8, 40, 4
 _SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
 _FEW = 3  # values, which are scanned closely: blurs of defocus agree within a tenth of it only
+_ELSEWHERE = 0.3  # scales: an end of a start that is another one
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
 _MOST_SAMPLES = 1024  # along a PSF
 _NAMES = {
@@ -426,6 +427,45 @@ class _State:
 
 
 @dataclass(frozen=True)
+class _Seen:
+    """PSFs at some values (P,), and how they change with each, over its scale: (Q, M, M), (P, Q, M, M)."""
+
+    values: Tensor
+    bank: Tensor
+    changes: Tensor
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Of a step by Gauss and Newton: half the curvature of chi^2, and minus half its slope.
+
+    across: of the values (P, P). between: with the targets' own (S, P, 4). within: of these (S, 4, 4). slope (P,),
+    own_slope (S, 4).
+    """
+
+    across: Tensor
+    between: Tensor
+    within: Tensor
+    slope: Tensor
+    own_slope: Tensor
+
+    def schur(self) -> Tensor:
+        """What the targets leave to the values, (P, P): the inverse of their covariance."""
+        inverse = torch.linalg.inv(self.within)
+        return self.across - torch.einsum("spk,skl,sql->pq", self.between, inverse, self.between)
+
+    def solved(self, damping: float) -> tuple[Tensor, Tensor]:
+        """A damped step of the values (P,) and of the targets' own (S, 4), which are eliminated first."""
+        across = self.across + damping * torch.diag(self.across.diagonal())
+        within = self.within + damping * torch.diag_embed(self.within.diagonal(dim1=-2, dim2=-1))
+        inverse = torch.linalg.inv(within)
+        right = self.slope - torch.einsum("spk,skl,sl->p", self.between, inverse, self.own_slope)
+        damped = replace(self, across=across, within=within)
+        step = torch.linalg.solve(damped.schur(), right)
+        return step, torch.einsum("skl,sl->sk", inverse, self.own_slope - torch.einsum("spk,p->sk", self.between, step))
+
+
+@dataclass(frozen=True)
 class _Problem:
     """chi^2 of the targets as a function of the lens and of places; levels are solved for."""
 
@@ -469,10 +509,11 @@ class _Fit:
         self.wide = torch.full_like(scales, _WIDE)
         self.weight = self._first_weight()
         best, others = self._search()
-        for _ in range(3):
+        for _ in range(2 if self.noise else 3):
             self.weight = self._weight_at(best)
             best = self._descend(best)
-        rivals = [self._descend(start) for start in (*self._twins(best), *others)]
+        elsewhere = [end for end in others if float(((end.values - best.values) / self.scales).norm()) > _ELSEWHERE]
+        rivals = [self._descend(start) for start in (*self._twins(best), *elsewhere)]
         better = min(rivals, key=lambda state: state.cost, default=best)
         if better.cost < best.cost - 1e-3:
             rivals.append(best)
@@ -541,8 +582,17 @@ class _Fit:
         left = (self.problem.targets.values - model).square() * self.weight
         return float(left.sum() + self._prior(values).square().sum())
 
-    def _normal(self, state: _State) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of the values (P, P), with the targets' own (S, P, 4), of these (S, 4, 4); slopes (P,), (S, 4)."""
+    @torch.no_grad()
+    def _differences(self, values: Tensor, bank: Tensor) -> Tensor:
+        """Change of PSFs with each value that acts, over its scale, (P, Q, M, M)."""
+        units = self.scales[self.free, None] * torch.eye(len(self.scales), dtype=torch.float64)[self.free]
+        moved = [self.problem.optics.bank(values + _DIFFERENCE * unit) - bank for unit in units]
+        return torch.stack(moved) / _DIFFERENCE
+
+    def _normal(self, state: _State, before: _Seen | None = None) -> tuple[_Equations, _Seen]:
+        """The equations of a step, and what they were made of; `before`: of the last step, whose differences of PSFs
+        are mended by what this step has changed (Broyden) instead of taken anew.
+        """
         problem, optics_ = self.problem, self.problem.optics
         graph = optics_.bank(state.values)
         model, levels = problem.model(graph, state.places, self.weight)
@@ -550,10 +600,14 @@ class _Fit:
         slope = optics_.slope((left.square() * self.weight).sum())
         bank, left = graph.detach(), left.detach()
         with torch.no_grad():
+            if before is None:
+                changes = self._differences(state.values, bank)
+            else:
+                step = ((state.values - before.values) / self.scales)[self.free]
+                missed = bank - before.bank - torch.einsum("p,pqyx->qyx", step, before.changes)
+                changes = before.changes + step[:, None, None, None] * missed / step.square().sum().clamp(min=1e-30)
             shape = problem.shapes(bank, state.places)
-            steps = _DIFFERENCE * self.scales
-            moved = [optics_.bank(state.values + steps[p] * _unit(p, len(steps))) - bank for p in self.free.tolist()]
-            columns = problem.shapes(torch.stack(moved) / steps[self.free, None, None, None], state.places)
+            columns = problem.shapes(changes, state.places) / self.scales[self.free, None, None]
             columns = columns * levels[:, 0, None]
             tangents = []
             for along in _PLACE_STEP * torch.eye(2, dtype=torch.float64):
@@ -567,21 +621,27 @@ class _Fit:
         across = flat @ flat.T + torch.diag((self.wide * self.scales)[self.free] ** -2)
         prior = self._prior(state.values) / (self.wide * self.scales)
         own_slope = torch.einsum("snk,sn->sk", weighted, left)
-        return across, between, within, (-slope / 2 - prior)[self.free], own_slope
+        equations = _Equations(across, between, within, (-slope / 2 - prior)[self.free], own_slope)
+        return equations, _Seen(state.values, bank, changes)
 
     def _descend(self, state: _State, *, until: float = 1e-4) -> _State:
         """Down to where a step gains less of chi^2 than this."""
         state = replace(state, cost=self._cost(state.values, state.places))
         freedom, damping = int(self.problem.targets.used.sum()), 1e-3
+        seen, age = None, 0
         for _ in range(_STEPS):
-            across, between, within, slope, own_slope = self._normal(state)
+            equations, seen = self._normal(state, seen)
             while damping < 1e8:
-                step, own_step = _solve(across, between, within, slope, own_slope, damping)
+                step, own_step = equations.solved(damping)
                 values = state.values.index_add(0, self.free, step)
                 places = state.places + own_step[:, :2].clamp(-2, 2)
                 cost = self._cost(values, places)
                 if cost < state.cost:
                     break
+                if age:  # with differences that are not its own
+                    equations, seen = self._normal(state)
+                    age = 0
+                    continue
                 damping *= 8
             else:
                 return state
@@ -589,6 +649,9 @@ class _Fit:
             damping = max(damping / 10, 1e-9)
             if gained < until * max(1.0, cost / freedom):
                 return state
+            age += 1
+            if age == _MENDED:
+                seen, age = None, 0
         return state
 
     def _search(self) -> tuple[_State, list[_State]]:
@@ -628,8 +691,7 @@ class _Fit:
     # -- what it means
 
     def _covariance(self, state: _State) -> Tensor:
-        across, between, within, _, _ = self._normal(state)
-        inside = torch.linalg.inv(_schur(across, between, within))
+        inside = torch.linalg.inv(self._normal(state)[0].schur())
         whole = torch.diag((self.wide * self.scales) ** 2)
         whole[self.free[:, None], self.free] = inside
         return whole
@@ -692,23 +754,6 @@ class _Fit:
 
         equal = [state for state in rivals if state.cost < best.cost + _SAME_FIT and apart(state) > _SAME_FIT]
         return min(equal, key=lambda state: state.cost, default=None)
-
-
-def _schur(across: Tensor, between: Tensor, within: Tensor) -> Tensor:
-    """What the targets leave to the values, (P, P)."""
-    return across - torch.einsum("spk,sqk->pq", between @ torch.linalg.inv(within), between)
-
-
-def _solve(
-    across: Tensor, between: Tensor, within: Tensor, slope: Tensor, own_slope: Tensor, damping: float
-) -> tuple[Tensor, Tensor]:
-    """A damped step of the values (P,) and of the targets' own (S, 4), who are eliminated first."""
-    across = across + damping * torch.diag(across.diagonal())
-    within = within + damping * torch.diag_embed(within.diagonal(dim1=-2, dim2=-1))
-    inverse = torch.linalg.inv(within)
-    right = slope - torch.einsum("spk,skl,sl->p", between, inverse, own_slope)
-    step = torch.linalg.solve(_schur(across, between, within), right)
-    return step, torch.einsum("skl,sl->sk", inverse, own_slope - torch.einsum("spk,p->sk", between, step))
 
 
 def _line(light: Tensor, squares: Tensor) -> tuple[float, float]:

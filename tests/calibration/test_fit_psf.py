@@ -96,7 +96,7 @@ def test_the_independent_camera_agrees_with_the_lens_in_the_slow_limit() -> None
 
 
 def test_two_focuses_give_all_terms_within_their_errors() -> None:
-    found_ = deviations(range(3))
+    found_ = deviations(range(2))
     assert (np.abs(found_) < 2).mean() >= 0.8
     assert np.abs(found_).max() < 4
 
@@ -132,8 +132,8 @@ def test_one_focus_leaves_the_sign_of_the_even_terms_open() -> None:
     assert {"Z1", "Z2", "Z3"} == set(fit.unobservable)
     assert all(math.isinf(fit.standard_errors[name]) for name in fit.unobservable)
     assert 0.9 < fit.chi_squared < 1.1
-    assert float(given.elements[2].coefficients.abs().max()) == 0  # what was given is as it was
-    assert float(fit.lens.elements[2].coefficients[7]) == fit.values["Z8"]
+    assert float(given.elements[2].coefficients.detach().abs().max()) == 0  # what was given is as it was
+    assert float(fit.lens.elements[2].coefficients.detach()[7]) == fit.values["Z8"]
     assert "the sign is ambiguous" in str(fit)
 
 
