@@ -27,7 +27,7 @@ LAYERS = [
     {"kcam.sensor"},
     {"kcam.isp"},
     {"kcam.camera"},
-    {"kcam.planner", "kcam.linear"},
+    {"kcam.planner", "kcam.linear", "kcam.calibration"},
     {"kcam.augmentation", "kcam.data"},
     {"kcam.style"},
     {"kcam.tradeoff"},

@@ -61,7 +61,7 @@ class ColourFit:
     >>> raw = (reflectances * light) @ spectral.sensitivity("nikon_5100", wavelengths=wavelengths).T
     >>> fit = kcam.calibration.colour_matrix(raw, illuminant="D65")
     >>> round(fit.mean, 1), [type(stage).__name__ for stage in fit.stages()]
-    (1.0, ['WhiteBalance', 'ColourMatrix'])
+    (0.9, ['WhiteBalance', 'ColourMatrix'])
     """
 
     matrix: Tensor
@@ -215,7 +215,12 @@ def _check_order(patches: Tensor) -> None:
     light = reflectances @ spectral.xyz_weights(wavelengths, "D65")[:, 1]
     seen = patches[:, min(1, patches.shape[1] - 1)].clamp(min=0).sqrt().view(ROWS, COLUMNS)
     known = light.sqrt().view(ROWS, COLUMNS)
-    ways = {"": seen, "upside down": seen.flip(0, 1), "mirrored": seen.flip(1), "mirrored and upside down": seen.flip(0)}
+    ways = {
+        "": seen,
+        "upside down": seen.flip(0, 1),
+        "mirrored": seen.flip(1),
+        "mirrored and upside down": seen.flip(0),
+    }
     alike = {way: float(torch.corrcoef(torch.stack([t.flatten(), known.flatten()]))[0, 1]) for way, t in ways.items()}
     best = max(alike, key=lambda way: alike[way])
     if best and alike[best] > alike[""] + 0.1:
@@ -278,7 +283,9 @@ def colour_matrix(raw_patches: Tensor | ChartPatches, *, illuminant: str | Tenso
 
 def _checked_patches(given: Tensor | ChartPatches) -> Tensor:
     expected = "(24, C) raw values of the chart's patches, C >= 3"
-    values = as_numbers(given.values if isinstance(given, ChartPatches) else given, name="raw_patches", expected=expected)
+    values = as_numbers(
+        given.values if isinstance(given, ChartPatches) else given, name="raw_patches", expected=expected
+    )
     raw = values.detach().cpu()
     if raw.ndim != 2 or len(raw) != ROWS * COLUMNS or raw.shape[1] not in (3, len(CHANNELS)):
         fix = " Use raw_patches.T." if raw.ndim == 2 and raw.shape[1] == ROWS * COLUMNS else ""
@@ -351,7 +358,7 @@ def delta_e(colours: Tensor, other: Tensor) -> Tensor:
     Example:
     >>> gray = torch.tensor([0.5, 0.5, 0.5], dtype=torch.float64)
     >>> round(float(kcam.calibration.delta_e(1.02 * gray, gray)), 2)  # a fiftieth of the light
-    0.51
+    0.44
     """
     (l1, a1, b1), (l2, a2, b2) = (_lab(values).unbind(-1) for values in (colours, other))
 

@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from kcam import optics
 from kcam.calibration.targets import Targets, find_targets
 from kcam.inputs import describe
-from kcam.optics.elements.element import Element
 from kcam.optics.propagation.question import residual_path
 from kcam.units import as_numbers, check_length, check_pixel_pitch, wavelength_grid
 
@@ -33,6 +32,7 @@ _DIFFERENCE = 1e-3  # of the scale: steps of the differences that make columns
 _PLACE_STEP = 1e-4  # pixels, or radians: of central ones
 _WIDE = 25.0  # scales: the prior, far beyond what a linear fit can say; it holds what the picture does not
 _UNSEEN = 5.0  # scales: a value known no better than this is not seen
+_INFLATED = 3e3  # times the variance that it would have if all else were known: it is another value's twin
 _CLOSE = 1.0  # scales: the prior of what is not seen, once that is known
 _STARTS, _STEPS, _MENDED = 8, 40, 4
 _SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
@@ -159,7 +159,7 @@ def fit_psf(
     shares = _shares(weights, len(bands))
     if target not in ("auto", "points", "edge"):
         raise ValueError(f"target {target!r} is unknown; expected points, edge or auto.")
-    if full_well is not None and not full_well > 0 or not read_noise >= 0:
+    if (full_well is not None and not full_well > 0) or not read_noise >= 0:
         raise ValueError(f"full_well must be > 0 and read_noise >= 0 electrons, got {full_well} and {read_noise}.")
     far = getattr(lens, "focus_distance", math.inf) if distances is None else distances
     away = _each(far, len(pictures), name="distances")
@@ -374,7 +374,9 @@ def _trained(lens: nn.Module) -> tuple[list[str], Tensor]:
         if not parameter.requires_grad:
             continue
         if parameter.numel() > MOST_VALUES:
-            raise ValueError(f"{name} has {parameter.numel()} numbers that train, more than {MOST_VALUES}: use Zernikes.")
+            raise ValueError(
+                f"{name} has {parameter.numel()} numbers that train, more than {MOST_VALUES}: use Zernikes."
+            )
         values.append(parameter.detach().double().cpu().flatten())
         owner = name.rpartition(".")[0]
         if owner in zernikes:
@@ -518,9 +520,9 @@ class _Fit:
         if better.cost < best.cost - 1e-3:
             rivals.append(best)
             best = better
-        covariance = self._covariance(best)
+        covariance, inflation = self._covariance(best)
         errors = covariance.diagonal().sqrt()
-        unseen = self._unseen(errors, scales)
+        unseen = self._unseen(errors, inflation, scales)
         rival = self._rival(best, rivals, covariance)
         apart = torch.zeros_like(errors) if rival is None else (rival.values - best.values).abs() / errors
         names = optics_.names
@@ -690,22 +692,25 @@ class _Fit:
 
     # -- what it means
 
-    def _covariance(self, state: _State) -> Tensor:
-        inside = torch.linalg.inv(self._normal(state)[0].schur())
-        whole = torch.diag((self.wide * self.scales) ** 2)
+    def _covariance(self, state: _State) -> tuple[Tensor, Tensor]:
+        """Of the values (P, P), and by what each variance is more than if all else were known (P,)."""
+        equations, _ = self._normal(state)
+        inside = torch.linalg.inv(equations.schur())
+        whole, inflation = torch.diag((self.wide * self.scales) ** 2), torch.ones_like(self.scales)
         whole[self.free[:, None], self.free] = inside
-        return whole
+        inflation[self.free] = inside.diagonal() * equations.across.diagonal()
+        return whole, inflation
 
-    def _unseen(self, errors: Tensor, scales: Tensor) -> dict[str, str]:
+    def _unseen(self, errors: Tensor, inflation: Tensor, scales: Tensor) -> dict[str, str]:
+        """Names of values that the picture does not tell, and why."""
         found = {}
-        for name, error, scale in zip(self.problem.optics.names, errors.tolist(), scales.tolist(), strict=True):
-            if math.isinf(scale):
+        for name, error, more, scale in zip(self.problem.optics.names, errors, inflation, scales, strict=True):
+            if bool(scale.isinf()):
                 found[name] = "no picture changes with it"
-            elif not error < _UNSEEN * scale:
-                found[name] = (
-                    "to first order this picture does not change with it, or as it does with a place, a level or "
-                    "another value that trains; a second focus, or an edge of another orientation, may show it"
-                )
+            elif bool(more > _INFLATED):
+                found[name] = "this picture changes with it as with a place, a level or another value that trains"
+            elif not bool(error < _UNSEEN * scale):
+                found[name] = "to first order this picture does not change with it: another focus may show it"
         return found
 
     def _twins(self, state: _State) -> Iterator[_State]:

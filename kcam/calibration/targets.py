@@ -56,9 +56,7 @@ class Targets:
         draw = self._points if self.kind == "points" else self._edges
         return draw(bank, which, place, step, width, upright)
 
-    def _points(
-        self, bank: Tensor, which: Tensor, place: Tensor, step: float, width: float, upright: bool
-    ) -> Tensor:
+    def _points(self, bank: Tensor, which: Tensor, place: Tensor, step: float, width: float, upright: bool) -> Tensor:
         count = bank.shape[-1]
         side = round(math.sqrt(self.x.shape[1]))
         frequency = torch.fft.fftfreq(count, d=step, dtype=torch.float64)  # cycles per pixel

@@ -26,9 +26,7 @@ def lens(terms: int | list[float], *, diameter: float = 2.5 * mm) -> optics.Lens
     """f/20, so that the paraxial diffraction of the independent camera is good to 3e-4 of the peak."""
     values = torch.zeros(terms, dtype=torch.float64) if isinstance(terms, int) else torch.tensor(terms).double()
     aberration = optics.ZernikeAberration(nn.Parameter(values))
-    return optics.Lens(
-        optics.CircularAperture(diameter), optics.ThinLens(50 * mm), aberration, focus_distance=math.inf
-    )
+    return optics.Lens(optics.CircularAperture(diameter), optics.ThinLens(50 * mm), aberration, focus_distance=math.inf)
 
 
 def behind(coefficients: dict[int, float], defocus: float) -> tuple[dict[int, float], float]:
@@ -41,7 +39,7 @@ def behind(coefficients: dict[int, float], defocus: float) -> tuple[dict[int, fl
 
 
 def points(coefficients: dict[int, float], *, seed: int, count: int = 2, defocus: float = 0.0) -> torch.Tensor:
-    """A picture of count^2 points by the independent camera, whose sensor stands `defocus` behind; light as it falls."""
+    """A picture of count^2 points by the independent camera, its sensor `defocus` behind; light as it falls."""
     draws = np.random.default_rng(1000 + seed)
     at = 18 + 34 * np.arange(count)
     places = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) + draws.uniform(-0.5, 0.5, (count**2, 2))
@@ -73,7 +71,11 @@ def member(seed: int) -> tuple[dict[int, float], torch.Tensor, tuple[float, floa
     draws = np.random.default_rng(seed)
     coefficients = {j: float(draws.normal(0, 25 * nm)) for j in range(4, 9)}
     steps = (0.0, float(draws.uniform(0.6, 1.0) * mm))
-    return coefficients, torch.cat([points(coefficients, seed=2 * seed + k, defocus=s) for k, s in enumerate(steps)]), steps
+    return (
+        coefficients,
+        torch.cat([points(coefficients, seed=2 * seed + k, defocus=s) for k, s in enumerate(steps)]),
+        steps,
+    )
 
 
 def deviations(seeds: range, **more: object) -> np.ndarray:
@@ -140,16 +142,16 @@ def test_one_focus_leaves_the_sign_of_the_even_terms_open() -> None:
 def test_a_known_defocus_settles_the_sign() -> None:
     """Of a lens whose own defocus is not in question."""
     truth = [0.0, 0, 0, 0, -20 * nm, 15 * nm]
-    aberration = optics.ZernikeAberration(nn.Parameter(torch.zeros(6, dtype=torch.float64)))
 
     class Fixed(optics.ZernikeAberration):
         """Without defocus."""
 
         def terms(self, pupil, wavelengths):  # type: ignore[no-untyped-def]
             keep = torch.tensor([0.0, 0, 0, 0, 1, 1], dtype=torch.float64)
-            return [(torch.ones_like(wavelengths), optics.elements.zernike.zernike_sum(keep * self.coefficients, pupil))]
+            return [
+                (torch.ones_like(wavelengths), optics.elements.zernike.zernike_sum(keep * self.coefficients, pupil))
+            ]
 
-    del aberration
     own = optics.Lens(
         optics.CircularAperture(2.5 * mm), optics.ThinLens(50 * mm),
         Fixed(nn.Parameter(torch.zeros(6, dtype=torch.float64))), focus_distance=math.inf,
@@ -162,7 +164,7 @@ def test_a_known_defocus_settles_the_sign() -> None:
 
 
 def test_an_edge_shows_what_its_orientation_shows() -> None:
-    """Upright ones: the light's spread along x. Defocus and astigmatism at 0 add up there, and neither is known alone."""
+    """One of defocus alone: how much, but not on which side."""
     own = optics.Lens(
         optics.CircularAperture(2.5 * mm), optics.ThinLens(50 * mm), optics.Defocus(nn.Parameter(torch.zeros(()))),
         focus_distance=math.inf,
@@ -256,9 +258,7 @@ def test_the_gap_of_a_triplet_comes_back(change: float) -> None:
 
 def test_float32_parameters_and_pictures_will_do() -> None:
     aberration = optics.ZernikeAberration(nn.Parameter(torch.zeros(8)))
-    own = optics.Lens(
-        optics.CircularAperture(2.5 * mm), optics.ThinLens(50 * mm), aberration, focus_distance=math.inf
-    )
+    own = optics.Lens(optics.CircularAperture(2.5 * mm), optics.ThinLens(50 * mm), aberration, focus_distance=math.inf)
     fit = found(points({8: 30 * nm}, seed=1, count=1).float(), own)
     assert fit.values["Z8"] == pytest.approx(30 * nm, abs=4 * fit.standard_errors["Z8"])
     assert fit.lens.elements[2].coefficients.dtype == torch.float32
