@@ -20,14 +20,11 @@ import scipy
 import torch
 from torch import Tensor, nn
 
-from kcam import optics
 from kcam.calibration.targets import Targets, find_targets
+from kcam.calibration.trained import Conditions, TrainedLens, put_values, unit
 from kcam.inputs import describe
-from kcam.optics.propagation.question import residual_path
 from kcam.units import as_numbers, check_length, check_pixel_pitch, wavelength_grid
 
-MOST_VALUES = 64  # that train
-_NOTICED = 0.1  # relative change of a PSF that makes the scale of a value
 _DIFFERENCE = 1e-3  # of the scale: steps of the differences that make columns
 _PLACE_STEP = 1e-4  # pixels, or radians: of central ones
 _WIDE = 25.0  # scales: the prior, far beyond what a linear fit can say; it holds what the picture does not
@@ -39,7 +36,6 @@ _SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
 _FEW = 3  # values, which are scanned closely: blurs of defocus agree within a tenth of it only
 _ELSEWHERE = 0.3  # scales: an end of a start that is another one
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
-_MOST_SAMPLES = 1024  # along a PSF
 _NAMES = {
     1: "piston", 2: "tilt x", 3: "tilt y", 4: "defocus", 5: "astigmatism 45", 6: "astigmatism 0", 7: "coma y",
     8: "coma x", 9: "trefoil y", 10: "trefoil x", 11: "spherical",
@@ -168,8 +164,10 @@ def fit_psf(
         check_length(abs(step), name="defocus", within=(0.0, 0.05), example="50 * um")
     found = find_targets(pictures, kind=target, points=points)
     _check_saturation(found)
-    optics_ = _Optics.of(lens, found, pitch, bands, shares, away, steps, upright, len(pictures), pictures.shape[-2:])
-    problem = _Problem(found, optics_, math.sqrt(fill_factor), upright)
+    shape = (pictures.shape[2], pictures.shape[3])
+    width = math.sqrt(fill_factor)
+    conditions = Conditions(shape, pitch, width, bands, shares, away.tolist(), steps.tolist(), upright)
+    problem = _Problem(found, TrainedLens.of(lens, found, conditions))
     noise = None if full_well is None else (read_noise**2 / full_well**2, 1 / full_well)
     return _Fit(problem, noise).result(lens)
 
@@ -220,200 +218,6 @@ def _check_saturation(found: Targets) -> None:
                 f"{int(full.sum())} pixels of the target near x = {x:.0f}, y = {y:.0f} are at 1.0: saturated, so that "
                 "the shape of its peak is lost. Expose at most 0.8 of the full well."
             )
-
-
-# ---- the lens --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Optics:
-    """Copies of the lens, one for each picture, as a function of the vector of all that trains."""
-
-    copies: list[Any]
-    shifts: list[float]
-    distances: list[float]
-    fields: list[Tensor | None]  # of the targets of each picture, where the PSF varies
-    which: Tensor  # (S,) PSF of each target
-    names: list[str]
-    start: Tensor
-    wavelengths: Tensor
-    shares: Tensor
-    pitch: float
-    step: float  # between samples [pixels]
-    samples: int
-
-    @classmethod
-    def of(
-        cls,
-        lens: nn.Module,
-        found: Targets,
-        pitch: float,
-        wavelengths: Tensor,
-        shares: Tensor,
-        distances: Tensor,
-        shifts: Tensor,
-        upright: bool,
-        count: int,
-        shape: Sequence[int],
-    ) -> _Optics:
-        if not callable(getattr(lens, "psf", None)):
-            raise TypeError(f"lens must be an optics.Lens or an optics.CompoundLens, got {type(lens).__name__}.")
-        names, values = _trained(lens)
-        copies = []
-        for shift in shifts.tolist():
-            own: Any = copy.deepcopy(lens).double().cpu()
-            if not any(p is own.sensor_distance for p in own.parameters()):
-                own.sensor_distance = own.sensor_distance + shift
-            copies.append(own)
-        finest = 0.9 * float(wavelengths.min()) * float(lens.f_number) / 2  # type: ignore[arg-type]
-        step = min(1.0, finest / pitch)
-        samples = 2 * math.ceil((1.5 if found.kind == "edge" else 1.0) * (found.reach + 2) / step) + 1
-        if samples > _MOST_SAMPLES:
-            raise ValueError(
-                f"PSFs {2 * found.reach:.0f} pixels wide of {pitch * 1e6:.3g} um at f/{float(lens.f_number):.3g} take "  # type: ignore[arg-type]
-                f"{samples} samples a side, more than {_MOST_SAMPLES}. Focus better, or cut the picture smaller."
-            )
-        fields: list[Tensor | None] = [None] * count
-        which = found.picture
-        if getattr(lens, "varies", False) and found.kind == "points":
-            middle = (torch.tensor([shape[1], shape[0]], dtype=torch.float64) - 1) / 2
-            places = (found.origin + found.start - middle) * (-pitch if upright else pitch)
-            fields = [
-                _field(own, places[found.picture == index], wavelengths, float(distances[index]))
-                for index, own in enumerate(copies)
-            ]
-            which = torch.empty_like(found.picture)
-            which[found.picture.argsort(stable=True)] = torch.arange(len(which))
-        return cls(
-            copies, shifts.tolist(), distances.tolist(), fields, which, names, values, wavelengths, shares, pitch,
-            step, samples,
-        )  # fmt: skip
-
-    def put(self, values: Tensor) -> None:
-        """Give the copies these values."""
-        for own, shift in zip(self.copies, self.shifts, strict=True):
-            _put(own, values, shift)
-
-    def bank(self, values: Tensor) -> Tensor:
-        """PSFs (Q, M, M) at these values, with a graph to `parameters`."""
-        self.put(values)
-        parts = []
-        for own, distance, field in zip(self.copies, self.distances, self.fields, strict=True):
-            asked: dict[str, Any] = {} if field is None else {"field": field}
-            found = own.psf(
-                self.wavelengths,
-                distances=distance,
-                pixel_pitch=self.pitch * self.step,
-                shape=(self.samples, self.samples),
-                integrate=False,
-                dtype=torch.float64,
-                **asked,
-            )
-            found = torch.einsum("...lyx,l->...yx", found, self.shares)
-            parts.append(found.flatten(0, -3))
-        return torch.cat(parts)
-
-    def slope(self, loss: Tensor) -> Tensor:
-        """d loss / d values (P,), through the lens."""
-        held = [p for own in self.copies for p in own.parameters() if p.requires_grad]
-        grads = torch.autograd.grad(loss, held, allow_unused=True)
-        flat = [torch.zeros_like(p).flatten() if g is None else g.flatten() for p, g in zip(held, grads, strict=True)]
-        return torch.cat(flat).view(len(self.copies), -1).sum(0)
-
-    @torch.no_grad()
-    def scales(self) -> Tensor:
-        """Change of each value that changes PSFs by a tenth, (P,); inf where nothing does."""
-        base = self.bank(self.start)
-
-        def change(index: int, by: float) -> float:
-            try:
-                moved = self.bank(self.start + by * _unit(index, len(self.start)))
-            except ValueError:
-                return math.inf
-            return float((moved - base).norm() / base.norm())
-
-        found = []
-        for index in range(len(self.start)):
-            low, high = math.nan, math.inf
-            for power in range(-12, 3):
-                if change(index, 10.0**power) > _NOTICED:
-                    low, high = 10.0 ** (power - 1), 10.0**power
-                    break
-            for _ in range(5 if high < math.inf else 0):
-                middle = math.sqrt(low * high)
-                low, high = (low, middle) if change(index, middle) > _NOTICED else (middle, high)
-            found.append(high)
-        return torch.tensor(found, dtype=torch.float64)
-
-    @torch.no_grad()
-    def wavefront(self, values: Tensor) -> Tensor | None:
-        """Residual path over the pupil of the first picture, (n, n) [m], NaN outside; None where the lens has none."""
-        self.put(values)
-        own, side = self.copies[0], torch.linspace(-1, 1, 33, dtype=torch.float64)
-        middle = self.wavelengths[[len(self.wavelengths) // 2]]
-        if isinstance(own, optics.Lens):
-            query = own.query(middle, distances=self.distances[0], pixel_pitch=1e-6, shape=(1, 1))
-            coefficients, maps = residual_path(query, query.pupil(side[None, :], side[:, None]))
-            found = torch.einsum("t,tyx->yx", coefficients[0, 0], maps)
-            return found.masked_fill(side[None, :] ** 2 + side[:, None] ** 2 > 1, math.nan) if own.round else found
-        if isinstance(own, optics.CompoundLens):
-            waves, passes = own.opd(middle, distances=self.distances[0], samples=33)
-            return (waves[0, 0] * middle).masked_fill(~passes[0, 0], math.nan)
-        return None
-
-
-def _unit(index: int, count: int) -> Tensor:
-    return torch.nn.functional.one_hot(torch.tensor(index), count).double()
-
-
-def _trained(lens: nn.Module) -> tuple[list[str], Tensor]:
-    """Names and values of what trains."""
-    zernikes = [name for name, part in lens.named_modules() if isinstance(part, optics.ZernikeAberration)]
-    names, values = [], []
-    for name, parameter in lens.named_parameters():
-        if not parameter.requires_grad:
-            continue
-        if parameter.numel() > MOST_VALUES:
-            raise ValueError(
-                f"{name} has {parameter.numel()} numbers that train, more than {MOST_VALUES}: use Zernikes."
-            )
-        values.append(parameter.detach().double().cpu().flatten())
-        owner = name.rpartition(".")[0]
-        if owner in zernikes:
-            prefix = "Z" if len(zernikes) == 1 else f"{owner}.Z"
-            names += [f"{prefix}{j + 1}" for j in range(parameter.numel())]
-        else:
-            names += [name] if parameter.ndim == 0 else [f"{name}[{k}]" for k in range(parameter.numel())]
-    if not names:
-        raise ValueError(
-            "nothing trains in this lens: make what is to be found a Parameter, such as "
-            "optics.ZernikeAberration(nn.Parameter(torch.zeros(11))) or Surface(thickness=nn.Parameter(...))."
-        )
-    if len(names) > MOST_VALUES:
-        raise ValueError(f"{len(names)} numbers of the lens train, more than {MOST_VALUES}: p.requires_grad_(False).")
-    return names, torch.cat(values)
-
-
-def _put(lens: nn.Module, values: Tensor, shift: float) -> None:
-    """Give a lens the values of all that trains."""
-    first = 0
-    for name, parameter in lens.named_parameters():
-        if parameter.requires_grad:
-            own = values[first : first + parameter.numel()].view_as(parameter)
-            parameter.data.copy_(own + shift if name == "sensor_distance" else own)
-            first += parameter.numel()
-
-
-@torch.no_grad()
-def _field(lens: Any, places: Tensor, wavelengths: Tensor, distance: float) -> Tensor:
-    """Object points (F, 2) whose chief rays fall at places (F, 2) [m]."""
-    field = -places / lens.image_scale
-    radius = places.norm(dim=1, keepdim=True).clamp(min=1e-12)
-    middle = wavelengths[[len(wavelengths) // 2]]
-    for _ in range(5):
-        fallen = lens.image_point(middle, distances=distance, field=field)[:, 0, 0].norm(dim=1, keepdim=True)
-        field = field * torch.where(fallen > 1e-9, radius / fallen.clamp(min=1e-12), 1.0)
-    return field
 
 
 # ---- the fit ---------------------------------------------------------------------------------------------------------
@@ -472,14 +276,12 @@ class _Problem:
     """chi^2 of the targets as a function of the lens and of places; levels are solved for."""
 
     targets: Targets
-    optics: _Optics
-    width: float
-    upright: bool
+    trained: TrainedLens
 
     def shapes(self, bank: Tensor, places: Tensor) -> Tensor:
         """(..., S, n)."""
-        how = {"step": self.optics.step, "width": self.width, "upright": self.upright}
-        return self.targets.shapes(bank, self.optics.which, places, **how)  # type: ignore[arg-type]
+        trained, how = self.trained, self.trained.conditions
+        return self.targets.shapes(bank, trained.which, places, step=trained.step, width=how.width, upright=how.upright)
 
     def levels(self, shape: Tensor, weight: Tensor) -> Tensor:
         """Brightness and background of each target (S, 2), by least squares."""
@@ -504,8 +306,8 @@ class _Fit:
 
     def result(self, lens: nn.Module) -> PSFFit:
         """All of it."""
-        optics_, targets = self.problem.optics, self.problem.targets
-        scales = optics_.scales()
+        trained, targets = self.problem.trained, self.problem.targets
+        scales = trained.scales()
         self.free = torch.nonzero(scales.isfinite()).flatten()
         self.scales = torch.where(scales.isfinite(), scales, 1.0)
         self.wide = torch.full_like(scales, _WIDE)
@@ -525,13 +327,13 @@ class _Fit:
         unseen = self._unseen(errors, inflation, scales)
         rival = self._rival(best, rivals, covariance)
         apart = torch.zeros_like(errors) if rival is None else (rival.values - best.values).abs() / errors
-        names = optics_.names
+        names = trained.names
         ambiguous = tuple(n for n, a in zip(names, apart.tolist(), strict=True) if a > 2 and n not in unseen)
         if unseen:  # of all fits that are as good, the one nearest to the lens that was given
             self.wide = torch.tensor([_CLOSE if name in unseen else _WIDE for name in names], dtype=torch.float64)
             best = self._descend(best)
         fitted = copy.deepcopy(lens)
-        _put(fitted, best.values, 0.0)
+        put_values(fitted, best.values)
         freedom = int(targets.used.sum()) - (len(names) - len(unseen)) - 4 * len(targets.values)
         places = best.places if targets.kind == "edge" else best.places + targets.origin
         return PSFFit(
@@ -561,7 +363,7 @@ class _Fit:
     def _weight_at(self, state: _State) -> Tensor:
         """1 / variance at the model, of known noise or of what is left."""
         targets = self.problem.targets
-        model, _ = self.problem.model(self.problem.optics.bank(state.values), state.places, self.weight)
+        model, _ = self.problem.model(self.problem.trained.bank(state.values), state.places, self.weight)
         light = model.clamp(min=0)
         peak = float(light.max())
         if self.noise is None:
@@ -573,12 +375,12 @@ class _Fit:
     # -- descent
 
     def _prior(self, values: Tensor) -> Tensor:
-        return (values - self.problem.optics.start) / (self.wide * self.scales)
+        return (values - self.problem.trained.start) / (self.wide * self.scales)
 
     @torch.no_grad()
     def _cost(self, values: Tensor, places: Tensor) -> float:
         try:
-            model, _ = self.problem.model(self.problem.optics.bank(values), places, self.weight)
+            model, _ = self.problem.model(self.problem.trained.bank(values), places, self.weight)
         except ValueError:  # no such lens
             return math.inf
         left = (self.problem.targets.values - model).square() * self.weight
@@ -588,18 +390,18 @@ class _Fit:
     def _differences(self, values: Tensor, bank: Tensor) -> Tensor:
         """Change of PSFs with each value that acts, over its scale, (P, Q, M, M)."""
         units = self.scales[self.free, None] * torch.eye(len(self.scales), dtype=torch.float64)[self.free]
-        moved = [self.problem.optics.bank(values + _DIFFERENCE * unit) - bank for unit in units]
+        moved = [self.problem.trained.bank(values + _DIFFERENCE * unit) - bank for unit in units]
         return torch.stack(moved) / _DIFFERENCE
 
     def _normal(self, state: _State, before: _Seen | None = None) -> tuple[_Equations, _Seen]:
         """The equations of a step, and what they were made of; `before`: of the last step, whose differences of PSFs
         are mended by what this step has changed (Broyden) instead of taken anew.
         """
-        problem, optics_ = self.problem, self.problem.optics
-        graph = optics_.bank(state.values)
+        problem, trained = self.problem, self.problem.trained
+        graph = trained.bank(state.values)
         model, levels = problem.model(graph, state.places, self.weight)
         left = problem.targets.values - model
-        slope = optics_.slope((left.square() * self.weight).sum())
+        slope = trained.slope((left.square() * self.weight).sum())
         bank, left = graph.detach(), left.detach()
         with torch.no_grad():
             if before is None:
@@ -673,12 +475,13 @@ class _Fit:
 
     def _scanned(self) -> Tensor:
         """Values that are better than those given, one after the other, by steps of many sizes."""
-        values, places = self.problem.optics.start, self.problem.targets.start
+        values, places = self.problem.trained.start, self.problem.targets.start
         lowest = self._cost(values, places)
         count = 20 if len(self.free) <= _FEW else 4
-        sizes = torch.logspace(*(math.log10(end) for end in _SCAN), count).tolist()
+        low, high = _SCAN
+        sizes = [low * (high / low) ** (k / (count - 1)) for k in range(count)]
         for index in self.free.tolist():
-            by = self.scales[index] * _unit(index, len(values))
+            by = self.scales[index] * unit(index, len(values))
             tried = [(self._cost(values + size * by, places), size) for size in (*sizes, *(-size for size in sizes))]
             cost, size = min(tried)
             if cost < lowest:
@@ -704,7 +507,7 @@ class _Fit:
     def _unseen(self, errors: Tensor, inflation: Tensor, scales: Tensor) -> dict[str, str]:
         """Names of values that the picture does not tell, and why."""
         found = {}
-        for name, error, more, scale in zip(self.problem.optics.names, errors, inflation, scales, strict=True):
+        for name, error, more, scale in zip(self.problem.trained.names, errors, inflation, scales, strict=True):
             if bool(scale.isinf()):
                 found[name] = "no picture changes with it"
             elif bool(more > _INFLATED):
@@ -715,7 +518,7 @@ class _Fit:
 
     def _twins(self, state: _State) -> Iterator[_State]:
         """Where the wavefront is as another one that has the same PSF, or the same edge."""
-        own = self.problem.optics.wavefront(state.values)
+        own = self.problem.trained.wavefront(state.values)
         if own is None:
             return
 
@@ -737,17 +540,21 @@ class _Fit:
         plane = [torch.ones_like(wanted), side[None, :].expand_as(wanted), side[:, None].expand_as(wanted)]
         for _ in range(3):
             try:
-                now = self.problem.optics.wavefront(values)
-                units = [s * _unit(p, len(values)) for p, s in enumerate(self.scales.tolist())]
-                moved = [self.problem.optics.wavefront(values + units[p]) for p in self.free.tolist()]
-            except ValueError:
+                now, *moved = self._wavefronts(values)
+            except ValueError:  # no such lens
                 return None
-            columns = torch.stack([*(m - now for m in moved), *(1e-7 * part for part in plane)])  # type: ignore[operator]
+            columns = torch.stack([*(path - now for path in moved), *(1e-7 * part for part in plane)])
             known = columns.isfinite().all(0) & wanted.isfinite()
             solved = scipy.linalg.lstsq(columns[:, known].T.numpy(), (wanted - now)[known].numpy(), cond=1e-6)[0]
             step = torch.from_numpy(solved)[: len(self.free)] * self.scales[self.free]
             values = values.index_add(0, self.free, step)
         return values
+
+    def _wavefronts(self, values: Tensor) -> list[Tensor]:
+        """At these values, and with each that acts a scale beyond."""
+        steps = [self.scales[index] * unit(index, len(values)) for index in self.free.tolist()]
+        found = [self.problem.trained.wavefront(values + step) for step in (torch.zeros_like(values), *steps)]
+        return [path for path in found if path is not None]
 
     def _rival(self, best: _State, rivals: list[_State], covariance: Tensor) -> _State | None:
         """The closest of the fits that are as good, and others."""
