@@ -35,6 +35,7 @@ _STARTS, _STEPS, _MENDED = 8, 40, 4
 _SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
 _FEW = 3  # values, which are scanned closely: blurs of defocus agree within a tenth of it only
 _ELSEWHERE = 0.3  # scales: an end of a start that is another one
+_APART = 3.0  # standard errors between two fits: a value that is ambiguous
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
 _NAMES = {
     1: "piston", 2: "tilt x", 3: "tilt y", 4: "defocus", 5: "astigmatism 45", 6: "astigmatism 0", 7: "coma y",
@@ -322,13 +323,14 @@ class _Fit:
         if better.cost < best.cost - 1e-3:
             rivals.append(best)
             best = better
-        covariance, inflation = self._covariance(best)
+        equations, _ = self._normal(best)
+        covariance, inflation = self._covariance(equations)
         errors = covariance.diagonal().sqrt()
         unseen = self._unseen(errors, inflation, scales)
-        rival = self._rival(best, rivals, covariance)
-        apart = torch.zeros_like(errors) if rival is None else (rival.values - best.values).abs() / errors
         names = trained.names
-        ambiguous = tuple(n for n, a in zip(names, apart.tolist(), strict=True) if a > 2 and n not in unseen)
+        rival, ambiguous = self._rival(
+            best, rivals, {n: e for n, e in zip(names, errors, strict=True) if n not in unseen}
+        )
         if unseen:  # of all fits that are as good, the one nearest to the lens that was given
             self.wide = torch.tensor([_CLOSE if name in unseen else _WIDE for name in names], dtype=torch.float64)
             best = self._descend(best)
@@ -342,7 +344,7 @@ class _Fit:
             {n: math.inf if n in unseen else e for n, e in zip(names, errors.tolist(), strict=True)},
             covariance,
             ambiguous,
-            dict(zip(names, rival.values.tolist(), strict=True)) if rival is not None and ambiguous else None,
+            dict(zip(names, rival.values.tolist(), strict=True)) if ambiguous else None,
             unseen,
             best.cost / max(freedom, 1),
             torch.cat([targets.picture[:, None].double(), places], dim=1),
@@ -495,10 +497,10 @@ class _Fit:
 
     # -- what it means
 
-    def _covariance(self, state: _State) -> tuple[Tensor, Tensor]:
+    def _covariance(self, equations: _Equations) -> tuple[Tensor, Tensor]:
         """Of the values (P, P), and by what each variance is more than if all else were known (P,)."""
-        equations, _ = self._normal(state)
-        inside = torch.linalg.inv(equations.schur())
+        size = self.scales[self.free]
+        inside = torch.linalg.inv(equations.schur() * size * size[:, None]) * size * size[:, None]
         whole, inflation = torch.diag((self.wide * self.scales) ** 2), torch.ones_like(self.scales)
         whole[self.free[:, None], self.free] = inside
         inflation[self.free] = inside.diagonal() * equations.across.diagonal()
@@ -556,16 +558,16 @@ class _Fit:
         found = [self.problem.trained.wavefront(values + step) for step in (torch.zeros_like(values), *steps)]
         return [path for path in found if path is not None]
 
-    def _rival(self, best: _State, rivals: list[_State], covariance: Tensor) -> _State | None:
-        """The closest of the fits that are as good, and others."""
-        information = torch.linalg.inv(covariance[self.free[:, None], self.free])
+    def _rival(self, best: _State, rivals: list[_State], errors: dict[str, Tensor]) -> tuple[_State, tuple[str, ...]]:
+        """Of the fits that are as good the one in which most of what is seen is another, and the names of that."""
 
-        def apart(state: _State) -> float:
-            by = (state.values - best.values)[self.free]
-            return float(by @ information @ by)
+        def others(state: _State) -> tuple[str, ...]:
+            apart = dict(zip(self.problem.trained.names, (state.values - best.values).abs(), strict=True))
+            return tuple(name for name, error in errors.items() if bool(apart[name] > _APART * error))
 
-        equal = [state for state in rivals if state.cost < best.cost + _SAME_FIT and apart(state) > _SAME_FIT]
-        return min(equal, key=lambda state: state.cost, default=None)
+        equal = [state for state in rivals if state.cost < best.cost + _SAME_FIT]
+        rival = max(equal, key=lambda state: len(others(state)), default=best)
+        return rival, others(rival)
 
 
 def _line(light: Tensor, squares: Tensor) -> tuple[float, float]:

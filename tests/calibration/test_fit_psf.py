@@ -13,6 +13,7 @@ from torch import nn
 
 from kcam import Camera, Scene, optics
 from kcam.calibration import PSFFit, fit_psf
+from kcam.optics.compound.tracing import trace
 from kcam.units import mm, nm, um
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -211,32 +212,47 @@ def triplet(change: float) -> optics.CompoundLens:
     return optics.CompoundLens(*surfaces, sensor_distance=focused.sensor_distance)
 
 
-def kirchhoff(own: optics.CompoundLens, field: tuple[float, float], *, pitch: float, size: int) -> np.ndarray:
-    """Light per pixel of a point's image, from rays alone: |sum of exp(ik path) over the stop|^2 on subpixels."""
-    from numpy.fft import fft2, fftshift, ifftshift
+def huygens(own: optics.CompoundLens, field: tuple[float, float], *, pitch: float, size: int) -> np.ndarray:
+    """Light per pixel of a point's image by a sum over rays, |sum of exp(ik path) d^2 cosines|^2, on 6 x 6 subpixels.
 
-    samples = 129
-    waves, passes = own.opd([WAVELENGTH], distances=math.inf, field=torch.tensor([field]), samples=samples)
-    pupil = (passes[0, 0, 0].numpy() * np.exp(2j * np.pi * waves[0, 0, 0].detach().numpy())) * 1.0
+    The window's middle is where the ray through the middle of the entrance pupil lands.
+    """
+    rays, wavelength = 221, torch.tensor([WAVELENGTH], dtype=torch.float64)
+    height = math.hypot(*field)
+    up = np.array(field) / height if height else np.array([0.0, 1.0])  # rays are traced for points at (0, height)
     first = own.first_order()
-    distance = float(own.sensor_distance) - float(first.exit_pupil.detach())
-    width = 2 * float(first.exit_semi_diameter.detach()) * samples / (samples - 1)
-    length = 1024
-    step = WAVELENGTH * distance / (width / samples * length)  # of a bin on the sensor
-    light = np.abs(fftshift(fft2(ifftshift(np.pad(pupil, (0, length - samples)))))) ** 2
-    at = (np.arange(length) - length // 2) * step
-    index = np.floor(at / pitch + size / 2).astype(int)
-    good = (index >= 0) & (index < size)
-    found_ = np.zeros((size, size))
-    rows, columns = np.meshgrid(index[good], index[good], indexing="ij")
-    np.add.at(found_, (rows, columns), light[np.ix_(good, good)])
-    return found_ / light.sum()
+    reach = 1.3 * float(first.entrance_semi_diameter.detach())
+    side = torch.linspace(-reach, reach, rays, dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64)
+    indices = [index.detach()[0] for index in own.indices(wavelength)]
+    found_ = {}
+    with torch.no_grad():
+        for name, (px, py) in {"all": (side[None, :], side[:, None]), "chief": (zero, zero)}.items():
+            traced = trace(own.surfaces, own.launch(zero + height, zero, px, py), indices)
+            run = float(own.sensor_distance) / traced.dz
+            x, y, path = traced.x + run * traced.dx, traced.y + run * traced.dy, traced.path + run
+            passes = traced.alive & (torch.stack([c for c in traced.clearance if c is not None]) >= 0).all(0)
+            found_[name] = [part.numpy() for part in (x, y, traced.dx, traced.dy, path, passes)]
+    x, y, dx, dy, path, passes = found_["all"]
+    wave = path - dx * x - dy * (y - found_["chief"][1])
+    (xy, xx), (yy, yx) = (np.gradient(part) for part in (dx, dy))
+    area = np.abs(xx * yy - xy * yx)
+    inside = passes & np.isfinite(wave) & np.isfinite(area)
+    k, (ux, uy) = 2 * np.pi / WAVELENGTH, up
+    amplitude = area[inside] * np.exp(1j * k * (wave[inside] - wave[inside].mean()))
+    at = (np.arange(6 * size) - (6 * size - 1) / 2) / 6 * pitch
+    # from the sensor's axes to those of the trace
+    cosines_x, cosines_y = dx[inside] * uy + dy[inside] * ux, dy[inside] * uy - dx[inside] * ux
+    columns = np.exp(1j * k * np.outer(at, cosines_x))
+    light = np.abs((np.exp(1j * k * np.outer(at, cosines_y)) * amplitude) @ columns.T) ** 2
+    pixels = light.reshape(size, 6, size, 6).sum((1, 3)) * (pitch / 6) ** 2
+    return pixels / (area[inside].sum() * WAVELENGTH**2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [0.04 * mm, -0.07 * mm])
 def test_the_gap_of_a_triplet_comes_back(change: float) -> None:
-    """Points in the field of a lens with another gap, light as it falls, drawn from the rays' wavefront by an FFT."""
+    """Points in the field of a lens with another gap, light as it falls, drawn by a sum over rays."""
     true = triplet(change)
     pitch, draws = 3 * um, np.random.default_rng(7)
     picture = np.full((95, 95), 10.0)
@@ -244,15 +260,15 @@ def test_the_gap_of_a_triplet_comes_back(change: float) -> None:
     for x, y in ((23, 23), (71, 23), (47, 47), (23, 71), (71, 71)):
         place = torch.tensor([(x - middle) * pitch, (y - middle) * pitch], dtype=torch.float64)
         field = (-place / true.image_scale.detach()).tolist()
-        picture[y - 20 : y + 21, x - 20 : x + 21] += 3e4 * kirchhoff(true, field, pitch=pitch, size=41)
+        picture[y - 20 : y + 21, x - 20 : x + 21] += 3e4 * huygens(true, field, pitch=pitch, size=41)
     taken = torch.from_numpy(draws.poisson(picture) + draws.normal(0, 2, picture.shape))
     fit = fit_psf(
         taken, lens=triplet(0.0), pixel_pitch=pitch, distances=math.inf, full_well=1.0, read_noise=2.0, upright=False
     )
     (name,) = fit.values
     assert name == "surfaces.1.thickness"
-    truth = float(true.surfaces[1].thickness)
-    assert fit.values[name] == pytest.approx(truth, abs=max(3 * fit.standard_errors[name], 0.01 * abs(change)))
+    truth = float(true.surfaces[1].thickness.detach())
+    assert fit.values[name] == pytest.approx(truth, abs=2 * fit.standard_errors[name])
     assert fit.standard_errors[name] < 1 * um
 
 
