@@ -34,6 +34,7 @@ _CLOSE = 1.0  # scales: the prior of what is not seen, once that is known
 _STARTS, _STEPS, _MENDED = 8, 40, 4
 _SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
 _FEW = 3  # values, which are scanned closely: blurs of defocus agree within a tenth of it only
+_QUIET = 3e-5  # of the peak: the least noise that is estimated; PSFs are no better
 _ELSEWHERE = 0.3  # scales: an end of a start that is another one
 _APART = 3.0  # standard errors between two fits: a value that is ambiguous
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
@@ -129,7 +130,8 @@ def fit_psf(
         target: "points", "edge", or "auto" to tell by the picture.
         points: (K, 2) x and y about where points are [pixels]; None to find them.
         full_well: electrons that the value 1.0 stands for (1.0 for a picture in electrons): then the noise is known,
-            with read_noise [electrons]. None: shot and read noise are estimated from what the fit leaves.
+            with read_noise [electrons]. None: shot and read noise are estimated from what the fit leaves, no less than
+            3e-5 of the peak, which is what PSFs are good to.
         fill_factor: light-sensitive share of a pixel.
         upright: the picture is as a camera shows it, turned by 180 degrees against the light on the sensor; False for
             light as it falls, as `Lens.psf` gives it.
@@ -298,21 +300,24 @@ class _Problem:
         return levels[:, 0, None] * shape + levels[:, 1, None], levels
 
 
-@dataclass
 class _Fit:
-    """The search, with the noise that it knows."""
+    """The search. `noise`: the variance, first + second * value, where it is known.
 
-    problem: _Problem
-    noise: tuple[float, float] | None  # variance = first + second * value
+    scales: (P,) of the values, 1 where nothing changes; free: which act. wide: (P,) widths of the prior, in scales.
+    weight: (S, n) of the pixels.
+    """
 
-    def result(self, lens: nn.Module) -> PSFFit:
-        """All of it."""
-        trained, targets = self.problem.trained, self.problem.targets
-        scales = trained.scales()
+    def __init__(self, problem: _Problem, noise: tuple[float, float] | None) -> None:
+        self.problem, self.noise = problem, noise
+        scales = problem.trained.scales()
         self.free = torch.nonzero(scales.isfinite()).flatten()
         self.scales = torch.where(scales.isfinite(), scales, 1.0)
         self.wide = torch.full_like(scales, _WIDE)
         self.weight = self._first_weight()
+
+    def result(self, lens: nn.Module) -> PSFFit:
+        """All of it."""
+        trained, targets = self.problem.trained, self.problem.targets
         best, others = self._search()
         for _ in range(2 if self.noise else 3):
             self.weight = self._weight_at(best)
@@ -326,7 +331,7 @@ class _Fit:
         equations, _ = self._normal(best)
         covariance, inflation = self._covariance(equations)
         errors = covariance.diagonal().sqrt()
-        unseen = self._unseen(errors, inflation, scales)
+        unseen = self._unseen(errors, inflation)
         names = trained.names
         rival, ambiguous = self._rival(
             best, rivals, {n: e for n, e in zip(names, errors, strict=True) if n not in unseen}
@@ -370,6 +375,7 @@ class _Fit:
         peak = float(light.max())
         if self.noise is None:
             first, second = _line(light[targets.used], (targets.values - model)[targets.used] ** 2)
+            first = max(first, (_QUIET * peak) ** 2)
         else:
             first, second = self.noise
         return targets.used / (first + second * light).clamp(min=max(1e-14 * peak**2, 1e-4 * second * peak))
@@ -506,15 +512,15 @@ class _Fit:
         inflation[self.free] = inside.diagonal() * equations.across.diagonal()
         return whole, inflation
 
-    def _unseen(self, errors: Tensor, inflation: Tensor, scales: Tensor) -> dict[str, str]:
+    def _unseen(self, errors: Tensor, inflation: Tensor) -> dict[str, str]:
         """Names of values that the picture does not tell, and why."""
         found = {}
-        for name, error, more, scale in zip(self.problem.trained.names, errors, inflation, scales, strict=True):
-            if bool(scale.isinf()):
+        for index, name in enumerate(self.problem.trained.names):
+            if index not in self.free.tolist():
                 found[name] = "no picture changes with it"
-            elif bool(more > _INFLATED):
+            elif bool(inflation[index] > _INFLATED):
                 found[name] = "this picture changes with it as with a place, a level or another value that trains"
-            elif not bool(error < _UNSEEN * scale):
+            elif not bool(errors[index] < _UNSEEN * self.scales[index]):
                 found[name] = "to first order this picture does not change with it: another focus may show it"
         return found
 

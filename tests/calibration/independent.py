@@ -52,19 +52,18 @@ def amplitude(
 
 def pixel_psf(
     coefficients: dict[int, float], *, wavelength: float, f_number: float, pitch: float, window: int,
-    moved: tuple[float, float] = (0.0, 0.0), oversampling: int = 1,
+    moved: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:  # fmt: skip
     """Share of the light in each of window x window pixels, as light falls, the image moved by (x, y) pixels.
 
-    oversampling: subpixels instead, so many a pixel. Gauss-Legendre nodes in each.
+    8 x 8 Gauss-Legendre nodes in each.
     """
-    node, weight = np.polynomial.legendre.leggauss(8 if oversampling == 1 else 2)
-    count, step = window * oversampling, pitch / oversampling
-    middle = (np.arange(count) - (count - 1) / 2) * step
-    x, y = ((middle[:, None] + node * step / 2).ravel() - shift * pitch for shift in moved)
+    node, weight = np.polynomial.legendre.leggauss(8)
+    middle = (np.arange(window) - (window - 1) / 2) * pitch
+    x, y = ((middle[:, None] + node * pitch / 2).ravel() - shift * pitch for shift in moved)
     light = np.abs(amplitude(coefficients, x, y, wavelength=wavelength, f_number=f_number)) ** 2
-    each = light.reshape(count, len(node), count, len(node))
-    return np.einsum("aibj,i,j->ab", each, weight, weight) * step**2 / 4
+    each = light.reshape(window, len(node), window, len(node))
+    return np.einsum("aibj,i,j->ab", each, weight, weight) * pitch**2 / 4
 
 
 def point_picture(
@@ -89,11 +88,12 @@ def edge_picture(
 ) -> np.ndarray:  # fmt: skip
     """Expected electrons of a half plane, bright where x cos + y sin > offset [pixels from the middle].
 
-    The half plane is drawn on subpixels by its covered area and convolved by an FFT with the PSF.
+    The half plane is drawn on subpixels by its covered area, convolved by an FFT with samples of the PSF (a box of one
+    subpixel is blurred by neither of both twice), and averaged over pixels.
     """
     window = 2 * max(shape)
-    psf = pixel_psf(coefficients, wavelength=wavelength, f_number=f_number, pitch=pitch, oversampling=oversampling,
-                    window=window + 1)  # fmt: skip
+    at = (np.arange((window + 1) * oversampling) - ((window + 1) * oversampling - 1) / 2) * pitch / oversampling
+    psf = np.abs(amplitude(coefficients, at, at, wavelength=wavelength, f_number=f_number)) ** 2
     height, width = (side + window for side in shape)
     y, x = np.meshgrid(
         (np.arange(height * oversampling) + 0.5) / oversampling - height / 2,
@@ -102,14 +102,14 @@ def edge_picture(
     )
     distance = x * math.cos(angle) + y * math.sin(angle) - offset
     wide, high = (abs(f(angle)) / oversampling for f in (math.cos, math.sin))
-    # area of a subpixel on the bright side: a box wide x high's trapezoid, integrated
-    u = distance
 
+    # area of a subpixel on the bright side: a box wide x high's trapezoid, integrated
     def ramp2(t: np.ndarray) -> np.ndarray:
         return np.maximum(t, 0) ** 2 / 2
 
-    covered = (ramp2(u + (wide + high) / 2) - ramp2(u + (wide - high) / 2) - ramp2(u - (wide - high) / 2)
-               + ramp2(u - (wide + high) / 2)) / (wide * high)  # fmt: skip
+    far, near = (wide + high) / 2, (wide - high) / 2
+    covered = ramp2(distance + far) - ramp2(distance + near) - ramp2(distance - near) + ramp2(distance - far)
+    covered = covered / (wide * high)
     size = (covered.shape[0] + psf.shape[0] - 1, covered.shape[1] + psf.shape[1] - 1)
     size = tuple(int(2 ** math.ceil(math.log2(side))) for side in size)
     seen = np.fft.irfft2(np.fft.rfft2(covered, size) * np.fft.rfft2(psf / psf.sum(), size), size)

@@ -99,9 +99,9 @@ def test_the_independent_camera_agrees_with_the_lens_in_the_slow_limit() -> None
 
 
 def test_two_focuses_give_all_terms_within_their_errors() -> None:
-    found_ = deviations(range(2))
+    found_ = deviations(range(1))
     assert (np.abs(found_) < 2).mean() >= 0.8
-    assert np.abs(found_).max() < 4
+    assert np.abs(found_).max() < 3
 
 
 @pytest.mark.slow
@@ -178,6 +178,37 @@ def test_an_edge_shows_what_its_orientation_shows() -> None:
     assert abs(fit.values[name]) == pytest.approx(vergence, abs=3 * fit.standard_errors[name])
     assert fit.standard_errors[name] < 0.05 * vergence
     assert float(fit.places[0, 1]) == pytest.approx(math.radians(5), abs=2e-3)
+
+
+@pytest.mark.slow
+def test_edges_at_any_angle_give_the_defocus_within_its_error() -> None:
+    draws, found_ = np.random.default_rng(11), []
+    for seed in range(20):
+        angle = float(draws.choice([0, 90, 180, 270]) + draws.choice([-1, 1]) * draws.uniform(3, 20))
+        truth = float(draws.uniform(40, 90) * nm)
+        own = optics.Lens(
+            optics.CircularAperture(2.5 * mm), optics.ThinLens(50 * mm), optics.Defocus(nn.Parameter(torch.zeros(()))),
+            focus_distance=math.inf,
+        )  # fmt: skip
+        fit = found(edge({4: truth}, angle=angle, seed=seed), own)
+        (name,) = fit.values
+        assert fit.ambiguous == (name,)
+        vergence = 4 * math.sqrt(3) * truth / (1.25 * mm) ** 2
+        found_.append((abs(fit.values[name]) - vergence) / fit.standard_errors[name])
+    assert (np.abs(found_) < 2).mean() >= 0.85  # 95 % less two of its own standard errors
+    assert 0.6 < np.sqrt(np.square(found_).mean()) < 1.4
+
+
+@pytest.mark.slow
+def test_light_of_several_wavelengths_counts_by_its_shares() -> None:
+    seen = lens([0.0] * 7 + [40 * nm])
+    colours, shares = [480 * nm, 550 * nm, 640 * nm], torch.tensor([0.2, 0.5, 0.3])
+    psf = seen.psf(colours, distances=math.inf, pixel_pitch=PITCH, shape=(35, 35), dtype=torch.float64).detach()
+    picture = (psf * shares[:, None, None]).sum(1)
+    fit = fit_psf(
+        picture, lens=lens(8), pixel_pitch=PITCH, wavelengths=colours, weights=2 * shares, upright=False
+    )  # fmt: skip
+    assert fit.values["Z8"] == pytest.approx(40 * nm, abs=0.5 * nm)
 
 
 @pytest.mark.slow
@@ -272,6 +303,7 @@ def test_the_gap_of_a_triplet_comes_back(change: float) -> None:
     assert fit.standard_errors[name] < 1 * um
 
 
+@pytest.mark.slow
 def test_float32_parameters_and_pictures_will_do() -> None:
     aberration = optics.ZernikeAberration(nn.Parameter(torch.zeros(8)))
     own = optics.Lens(optics.CircularAperture(2.5 * mm), optics.ThinLens(50 * mm), aberration, focus_distance=math.inf)
