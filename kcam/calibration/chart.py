@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import scipy
 import torch
 from torch import Tensor, nn
 
@@ -25,7 +27,8 @@ _MIDDLE = 0.5  # of a patch's width: what is averaged
 _FEWEST = 4  # pixels of a channel in a patch
 _SATURATED = 0.01  # share of a patch's pixels
 _UNEVEN, _DARK = 0.2, 0.03  # spread in a patch: of its own mean, and of the brightest patch
-_SMOOTH = 3e-4  # weight of the second differences of a sensitivity
+_GRAYS = slice(18, 24)  # from white to black
+_SMOOTH = 1e-3  # weight of the second differences of a sensitivity
 _FOLDS = 6
 _EPSILON = 1e-12
 
@@ -61,7 +64,7 @@ class ColourFit:
     >>> raw = (reflectances * light) @ spectral.sensitivity("nikon_5100", wavelengths=wavelengths).T
     >>> fit = kcam.calibration.colour_matrix(raw, illuminant="D65")
     >>> round(fit.mean, 1), [type(stage).__name__ for stage in fit.stages()]
-    (0.9, ['WhiteBalance', 'ColourMatrix'])
+    (0.8, ['WhiteBalance', 'ColourMatrix'])
     """
 
     matrix: Tensor
@@ -239,10 +242,10 @@ def _check_order(patches: Tensor) -> None:
 def colour_matrix(raw_patches: Tensor | ChartPatches, *, illuminant: str | Tensor) -> ColourFit:
     """White balance gains and the colour matrix of a camera, from its raw of the chart's 24 patches in a known light.
 
-    The raw of a perfect white follows from all patches: from the smoothest sensitivities that, in this light, see the
-    known reflectances so. The matrix takes it to (1,1,1) and the patches as close as can be to their colours under D65
-    (the colour of a surface is what it is in daylight, as of `isp.ColourMatrix`, in whatever light it was taken): by
-    least squares first, then in CIEDE2000.
+    The raw of a perfect white follows from the row of grays, as far as they are not gray by the smoothest sensitivities
+    that see all patches so in this light. The matrix takes it to (1,1,1) and the patches as close as can be to their
+    colours under D65 (the colour of a surface is what it is in daylight, as of `isp.ColourMatrix`, in whatever light it
+    was taken): by least squares first, then in CIEDE2000.
 
     Args:      raw_patches: (24, C) linear, black subtracted, any exposure, row by row from dark skin; or what
                `chart_patches` gives.
@@ -301,17 +304,20 @@ def _checked_patches(given: Tensor | ChartPatches) -> Tensor:
 
 
 def _white(raw: Tensor, reflected: Tensor, light: Tensor) -> Tensor:
-    """Raw of a perfect white, (C,): light @ s for the smoothest sensitivities s (L, C) with reflected @ s = raw."""
-    bands = len(light)
-    bend = torch.zeros(bands - 2, bands, dtype=torch.float64)
-    for row in range(bands - 2):
-        bend[row, row : row + 3] = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64)
-    relative = raw / raw.amax(0)
-    power = float((reflected / reflected.sum(1).max()).square().sum() / bands)
-    shared = reflected / reflected.sum(1).max()
-    normal = shared.T @ shared + _SMOOTH * power * bend.T @ bend
-    found = torch.linalg.solve(normal, shared.T @ relative)
-    return (light / reflected.sum(1).max()) @ found * raw.amax(0)
+    """Raw of a perfect white, (C,), by the row of grays: raw over what they reflect of what each channel sees.
+
+    Gray is not quite gray, so that share is weighted by the smoothest sensitivities s (L, C) >= 0 with reflected @ s
+    = raw.
+    """
+    shared = reflected / light.sum()
+    dark = torch.zeros(2, len(light), dtype=torch.float64)  # beyond the ends
+    bend = torch.eye(len(light), dtype=torch.float64).diff(n=2, dim=0, prepend=dark, append=dark)
+    system = torch.cat([shared, torch.sqrt(_SMOOTH * shared.square().sum() / len(light)) * bend])
+    known = torch.cat([raw / raw.amax(0), raw.new_zeros(len(bend), raw.shape[1])])
+    solved = [scipy.optimize.nnls(system.numpy(), column.numpy())[0] for column in known.T]
+    curves = torch.from_numpy(np.stack(solved, axis=1))
+    shares = (reflected @ curves / (light @ curves))[_GRAYS]
+    return raw[_GRAYS].sum(0) / shares.sum(0)
 
 
 def _refined(signals: Tensor, colours: Tensor) -> Tensor:

@@ -106,7 +106,7 @@ def test_two_focuses_give_all_terms_within_their_errors() -> None:
 
 @pytest.mark.slow
 def test_95_times_in_100_within_two_standard_errors() -> None:
-    found_ = deviations(range(40))
+    found_ = deviations(range(30))
     share, spread = (np.abs(found_) < 2).mean(), np.sqrt((found_**2).mean())
     assert share >= 0.95 - 2 * math.sqrt(0.95 * 0.05 / found_.size)
     assert 0.85 < spread < 1.15
