@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -100,7 +101,7 @@ def fit_psf(
     weights: Tensor | Sequence[float] | None = None,
     defocus: Tensor | Sequence[float] | float = 0.0,
     target: str = "auto",
-    points: Tensor | None = None,
+    points: Tensor | Sequence[Sequence[float]] | None = None,
     full_well: float | None = None,
     read_noise: float = 0.0,
     fill_factor: float = 1.0,
@@ -160,6 +161,12 @@ def fit_psf(
         raise ValueError(f"target {target!r} is unknown; expected points, edge or auto.")
     if (full_well is not None and not full_well > 0) or not read_noise >= 0:
         raise ValueError(f"full_well must be > 0 and read_noise >= 0 electrons, got {full_well} and {read_noise}.")
+    if not 0 < fill_factor <= 1:
+        raise ValueError(f"fill_factor {fill_factor:g} must be in (0, 1]: the light-sensitive share of a pixel.")
+    if points is not None:
+        points = as_numbers(points, name="points", expected="x and y of each point in pixels, (K, 2)").detach().cpu()
+        if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not bool(points.isfinite().all()):
+            raise ValueError(f"points must be finite x and y in pixels, (K, 2), got shape {tuple(points.shape)}.")
     far = getattr(lens, "focus_distance", math.inf) if distances is None else distances
     away = _each(far, len(pictures), name="distances")
     steps = _each(defocus, len(pictures), name="defocus")
@@ -172,7 +179,10 @@ def fit_psf(
     conditions = Conditions(shape, pitch, width, bands, shares, away.tolist(), steps.tolist(), upright)
     problem = _Problem(found, TrainedLens.of(lens, found, conditions))
     noise = None if full_well is None else (read_noise**2 / full_well**2, 1 / full_well)
-    return _Fit(problem, noise).result(lens)
+    with torch.enable_grad(), warnings.catch_warnings():
+        problem.trained.bank(problem.trained.start)  # may warn of the lens that was given; not of what the search tries
+        warnings.filterwarnings("ignore", message=r"f/\S+ is outside", category=UserWarning)
+        return _Fit(problem, noise).result(lens)
 
 
 # ---- what goes in ----------------------------------------------------------------------------------------------------

@@ -234,6 +234,24 @@ def test_a_picture_of_a_camera_is_turned_against_the_light() -> None:
     assert fit.values["Z8"] == pytest.approx(-50 * nm, abs=1 * nm)
 
 
+@pytest.mark.parametrize("what", ["diameter", "sensor_distance"])
+def test_whatever_trains_is_found(what: str) -> None:
+    """Under no_grad, too; the search tries apertures beyond those that are tested, and does not say so."""
+    picture = points({}, seed=9, defocus=0.3 * mm)
+    given = {"diameter": 2.4 * mm, "sensor_distance": 50 * mm}
+    truth = {"diameter": 2.5 * mm, "sensor_distance": 50.3 * mm}
+    values = truth | {what: nn.Parameter(torch.tensor(given[what], dtype=torch.float64))}
+    own = optics.Lens(
+        optics.CircularAperture(values["diameter"]), optics.ThinLens(50 * mm), sensor_distance=values["sensor_distance"]
+    )
+    with torch.no_grad():
+        fit = found(picture, own, distances=math.inf)
+    (name,) = fit.values
+    assert name.endswith(what)
+    assert fit.values[name] == pytest.approx(truth[what], abs=2.5 * fit.standard_errors[name])
+    assert fit.standard_errors[name] < 2e-3 * truth[what]
+
+
 def triplet(change: float) -> optics.CompoundLens:
     surfaces = list(optics.CompoundLens.preset("cooke_triplet").surfaces)
     one = surfaces[1]
@@ -332,6 +350,9 @@ STAR[0, 0, 19:22, 19:22] += 0.5
         (STAR, {"defocus": 50.0}, r"defocus 50 is outside"),
         (STAR, {"defocus": (0.0, 1e-4)}, "defocus has 2 values, expected one, or one for each of 1"),
         (STAR, {"weights": [1.0, 2.0]}, "weights must be 1 numbers"),
+        (STAR, {"fill_factor": 1.5}, "fill_factor 1.5 must be in"),
+        (STAR, {"points": [1.0, 2.0]}, r"points must be finite x and y in pixels, \(K, 2\)"),
+        (STAR, {"points": [[2.0, 20.0]]}, "too small"),
         (STAR, {"full_well": -1.0}, "full_well must be > 0"),
         (torch.where(torch.arange(41) > 20, 0.8, 0.1).expand(1, 1, 41, 41), {}, "Slant it by 5 degrees"),
         (torch.where(torch.arange(9) > 4, 0.8, 0.1).expand(1, 1, 9, 9), {"target": "edge"}, "too small for a slanted"),
