@@ -1,9 +1,10 @@
-"""Calibration of a real camera from its frames: sensor curves, noise and fixed pattern."""
+"""Calibration: what a camera of one's own is, from frames and pictures that it took."""
 
 from __future__ import annotations
 
 import os
 
+from kcam.calibration.chart import ChartPatches, ColourFit, chart_patches, colour_matrix, delta_e
 from kcam.calibration.frames import exposure_time, find, pairs, read_frame, read_times
 from kcam.calibration.photon_transfer import (
     UNITS,
@@ -14,6 +15,7 @@ from kcam.calibration.photon_transfer import (
     Spatial,
     photon_transfer,
 )
+from kcam.calibration.psf import PSFFit, fit_psf
 
 
 def save_report(found: SensorCalibration, path: str | os.PathLike[str]) -> None:
@@ -36,12 +38,19 @@ def save_report(found: SensorCalibration, path: str | os.PathLike[str]) -> None:
 __all__ = [
     "UNITS",
     "ChannelCalibration",
+    "ChartPatches",
+    "ColourFit",
     "Level",
+    "PSFFit",
     "Quantity",
     "SensorCalibration",
     "Spatial",
+    "chart_patches",
+    "colour_matrix",
+    "delta_e",
     "exposure_time",
     "find",
+    "fit_psf",
     "pairs",
     "photon_transfer",
     "read_frame",
