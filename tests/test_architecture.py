@@ -33,6 +33,7 @@ LAYERS = [
     {"kcam.tradeoff"},
     {"kcam.plots"},
     {"kcam.report"},
+    {"kcam.analysis"},
     {"kcam.demo", "kcam.shoot", "kcam.train"},
     {"kcam.cli"},
     {"kcam.__main__"},

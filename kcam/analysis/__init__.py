@@ -18,9 +18,11 @@ from kcam.analysis.camera import (
 )
 from kcam.analysis.edge import EdgeResponse, slanted_edge_mtf
 from kcam.analysis.noise import NoisePower, noise_power_spectrum
+from kcam.analysis.page import STEPS, Report, report
 
 __all__ = [
-    "LIGHTS", "ColourError", "DynamicRange", "EdgeResponse", "NoisePower", "NotMeasured", "SignalToNoise",
+    "LIGHTS", "ColourError", "DynamicRange", "EdgeResponse", "NoisePower", "NotMeasured", "Report", "STEPS",
+    "SignalToNoise",
     "colour_error", "distortion", "dynamic_range", "edge_response", "half_diagonal", "imaging_of", "noise_power",
-    "noise_power_spectrum", "shading", "signal_to_noise", "slanted_edge_mtf",
+    "noise_power_spectrum", "report", "shading", "signal_to_noise", "slanted_edge_mtf",
 ]  # fmt: skip
