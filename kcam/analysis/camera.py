@@ -238,7 +238,7 @@ def edge_response(
     side = size + 2 * margin
     grid = context.wavelengths
     if imaging is not None and imaging.varies:  # tracing a field takes seconds a band
-        grid = torch.linspace(float(grid.min()), float(grid.max()), min(len(grid), FIELD_BANDS), dtype=torch.float64)
+        grid = _few(grid)
     light = spectral.illuminant("D65", wavelengths=grid)
     dark, rise = _response(camera) if whole else (0.0, 1.0)
     bright = 0.8 if not whole else min(0.8, 0.75 * (1 - dark) / rise)
@@ -284,6 +284,11 @@ def edge_response(
         taken = taken if imaging is None else taken * torch.sinc(along / FINE)
         chart = chart * taken / torch.sinc(pixel * along)
     return EdgeResponse(found.frequencies, found.mtf / chart, found.angle, found.contrast, pitch)
+
+
+def _few(grid: Tensor) -> Tensor:
+    """As far as these bands, but few of them."""
+    return torch.linspace(float(grid.min()), float(grid.max()), min(len(grid), FIELD_BANDS), dtype=torch.float64)
 
 
 def _overlap(width: float) -> Tensor:
@@ -475,7 +480,9 @@ def half_diagonal(camera: Camera, size: tuple[int, int] | None = None) -> float:
 
 
 @torch.no_grad()
-def shading(camera: Camera, radii: Sequence[float] | Tensor | None = None, *, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
+def shading(
+    camera: Camera, radii: Sequence[float] | Tensor | None = None, *, size: tuple[int, int] | None = None
+) -> tuple[Tensor, Tensor]:
     """Light of an even scene over the field relative to the axis: radii (N,) [m] and shares (C,N) of each channel.
 
     Raises:    NotMeasured as `half_diagonal`, and for optics that are computed on the axis alone.
@@ -489,22 +496,39 @@ def shading(camera: Camera, radii: Sequence[float] | Tensor | None = None, *, si
     if not imaging.varies:
         raise NotMeasured("these optics are computed on the axis alone: no shading. Use a CompoundLens or field=True.")
     places = torch.linspace(0, half_diagonal(camera, size), 9) if radii is None else torch.as_tensor(radii)
-    light, behind = [], _behind(camera)
-    curves = None if not isinstance(behind[0] if len(behind) else None, sensor.ColourFilter) else behind[0]
-    grid = context.wavelengths
-    weights = spectral.xyz_weights(grid)[:, 1:2].T if curves is None else curves.contraction(grid).detach()
-    distance = float(getattr(imaging.lens, "focus_distance", 2.0))
-    spectrum = spectral.illuminant("D65", wavelengths=grid)
-    for radius in [0.0, *places.tolist()]:
-        scene = Scene(torch.ones(1, 1, 17, 17), spectrum[None], grid, distance, spectrum)
-        bands = imaging.changed(centre=(radius, 0.0))(scene, context)[0, :, 8, 8].double()
-        light.append(weights.double() @ bands)
-    values = torch.stack(light, dim=1)
-    return places.double(), values[:, 1:] / values[:, :1]
+    places, behind, grid = places.double(), _behind(camera), _few(context.wavelengths)
+    first = behind[0] if len(behind) else None
+    weights = spectral.xyz_weights(grid)[:, 1:2].T
+    if isinstance(first, sensor.ColourFilter):
+        weights = first.contraction(grid).detach().double().cpu()
+    weights = weights * spectral.illuminant("D65", wavelengths=grid)
+    lens: Any = imaging.lens
+    if not hasattr(lens, "relative_illumination"):
+        raise NotMeasured(f"a {type(lens).__name__} does not say how its light falls off over the field.")
+    fields = torch.tensor([[0.0, _height(lens, radius)] for radius in [0.0, *places.tolist()]], dtype=torch.float64)
+    bands = [
+        lens.relative_illumination(fields, wavelengths=[one], distances=lens.focus_distance) for one in grid.tolist()
+    ]
+    values = weights @ torch.stack(bands).detach().double().cpu()
+    return places, values[:, 1:] / values[:, :1]
+
+
+def _height(lens: optics.CompoundLens, radius: float) -> float:
+    """Y / D of the point whose image lies at a radius [m]."""
+    if radius == 0:
+        return 0.0
+    height = radius / (float(_landed(lens, 1e-4)) / 1e-4)
+    for _ in range(30):
+        height, before = height * radius / float(_landed(lens, height)), height
+        if abs(height / before - 1) < 1e-9:
+            break
+    return height
 
 
 @torch.no_grad()
-def distortion(camera: Camera, radii: Sequence[float] | Tensor | None = None, *, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
+def distortion(
+    camera: Camera, radii: Sequence[float] | Tensor | None = None, *, size: tuple[int, int] | None = None
+) -> tuple[Tensor, Tensor]:
     """How far images lie from where a lens without distortion has them: radii (N,) [m] and shares (N,), < 0 for barrel.
 
     D = h / (m y) - 1,   h: the chief ray's height on the sensor,  m y: that of a small field, extended
@@ -519,18 +543,13 @@ def distortion(camera: Camera, radii: Sequence[float] | Tensor | None = None, *,
     """
     imaging = _lens_of(camera)
     if not imaging.varies or not hasattr(imaging.lens, "image_heights"):
-        raise NotMeasured("these optics have no distortion: they are computed on the axis alone, or have no chief rays.")
+        raise NotMeasured(
+            "these optics have no distortion: they are computed on the axis alone, or have no chief rays."
+        )
     places = (torch.linspace(0, half_diagonal(camera, size), 9) if radii is None else torch.as_tensor(radii)).double()
     lens: Any = imaging.lens
-    scale, found = float(_landed(lens, 1e-4)) / 1e-4, []
-    for radius in places.tolist():
-        height = max(radius, 1e-6) / scale
-        for _ in range(30):  # the field whose image lies there
-            landed = float(_landed(lens, height))
-            height, before = height * max(radius, 1e-6) / landed, height
-            if abs(height / before - 1) < 1e-9:
-                break
-        found.append(max(radius, 1e-6) / (scale * height) - 1)
+    scale = float(_landed(lens, 1e-4)) / 1e-4
+    found = [radius / (scale * _height(lens, radius)) - 1 if radius else 0.0 for radius in places.tolist()]
     return places, torch.tensor(found, dtype=torch.float64)
 
 

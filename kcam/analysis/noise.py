@@ -74,5 +74,3 @@ def noise_power_spectrum(pictures: Tensor, *, pixel_pitch: float | None = None) 
     radial = torch.bincount(ring[used], weights=power[used], minlength=count // 2 + 1)[1:] / weights
     frequencies = torch.bincount(ring[used], weights=radius[used], minlength=count // 2 + 1)[1:] / weights / pitch
     return NoisePower(fy, fx, power, frequencies, radial)
-
-

@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from kcam import files, plots
+from kcam import files, optics, plots
 from kcam.analysis.camera import (
     LIGHTS,
     ColourError,
@@ -119,9 +119,11 @@ class Report:
                 axes.plot(one.frequencies, one.mtf, style, color=colour, lw=1.5, label=label)
             axes.axhline(0.5, color=plots.MUTED, lw=0.8, ls=":")
             axes.axvline(0.5, color=plots.MUTED, lw=0.8, ls=":")
-            axes.set(xlim=(0, 1), ylim=(0, 1.25))
+            axes.set(xlim=(0, 0.8), ylim=(0, 1.25))
             axes.legend(frameon=False, fontsize=plots.SMALL - 1)
-            shown.append(("MTF: contrast over frequency; the dots mark half the contrast and the pixels' limit", figure))
+            shown.append(
+                ("MTF: contrast over frequency; the dots mark half the contrast and the pixels' limit", figure)
+            )
         if self.signal_to_noise is not None and bool(self.signal_to_noise.snr.isfinite().all()):
             axes, figure = _axes("electrons", "SNR")
             axes.loglog(self.signal_to_noise.electrons, self.signal_to_noise.snr, "o-", color=plots.INK, ms=3.5)
@@ -150,7 +152,11 @@ class Report:
             axes.plot(known.frequencies / limit, known.radial / white, color=plots.INK, lw=1.5)
             axes.set_ylim(bottom=0)
             shown.append(("Noise power over frequency; 1 is noise without correlation", figure))
-        return shown + ([("Point spread functions", self.psf)] if self.psf is not None else [])
+        return shown + (
+            [("Point spread functions, or spots over the field of a traced lens", self.psf)]
+            if self.psf is not None
+            else []
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page: one HTML file that holds all it shows. Raises: ValueError as `kcam.report.write_report`."""
@@ -228,8 +234,13 @@ def report(
         imaging = imaging_of(camera)
         if imaging is None:
             raise NotMeasured("this camera has no lens: no optics.Imaging among its stages.")
-        with torch.no_grad():
+        if not isinstance(imaging.lens, optics.CompoundLens):
             return plots.psf_figure(imaging)
+        lens = imaging.lens
+        height = 0.8 * lens.field_limit(distance=lens.focus_distance, least=0.4)
+        heights = torch.linspace(0, height, 6, dtype=torch.float64)
+        curves = lens.field_curves(heights, distance=lens.focus_distance, frequencies=[10 / mm, 30 / mm])
+        return plots.lens_figure(lens, curves, distance=lens.focus_distance, title="The lens over its field")
 
     with torch.no_grad():
         return Report(
