@@ -21,8 +21,25 @@ from kcam.analysis.noise import NoisePower, noise_power_spectrum
 from kcam.analysis.page import STEPS, Report, report
 
 __all__ = [
-    "LIGHTS", "ColourError", "DynamicRange", "EdgeResponse", "NoisePower", "NotMeasured", "Report", "STEPS",
+    "LIGHTS",
+    "STEPS",
+    "ColourError",
+    "DynamicRange",
+    "EdgeResponse",
+    "NoisePower",
+    "NotMeasured",
+    "Report",
     "SignalToNoise",
-    "colour_error", "distortion", "dynamic_range", "edge_response", "half_diagonal", "imaging_of", "noise_power",
-    "noise_power_spectrum", "report", "shading", "signal_to_noise", "slanted_edge_mtf",
+    "colour_error",
+    "distortion",
+    "dynamic_range",
+    "edge_response",
+    "half_diagonal",
+    "imaging_of",
+    "noise_power",
+    "noise_power_spectrum",
+    "report",
+    "shading",
+    "signal_to_noise",
+    "slanted_edge_mtf",
 ]  # fmt: skip

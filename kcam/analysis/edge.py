@@ -109,7 +109,7 @@ def slanted_edge_mtf(
         image = image[: round(turns / abs(slope))]
     bins = _edge_spread(image, offset, slope)
     spread = bins[2:] - bins[:-2]  # the line spread
-    _check_single(spread)
+    _check_single(_coarse_steps(image, offset, slope))
     centre = float((spread.abs() ** 2 * torch.arange(len(spread))).sum() / (spread.abs() ** 2).sum())
     half = min(centre, len(spread) - 1 - centre)
     place = ((torch.arange(len(spread), dtype=torch.float64) - centre) / half).abs()
@@ -201,8 +201,12 @@ def _edge_spread(image: Tensor, offset: float, slope: float) -> Tensor:
     inside = (index >= 0) & (index <= 2 * half)
     count = torch.bincount(index[inside], minlength=2 * half + 1).double()
     total = torch.bincount(index[inside], weights=image[inside], minlength=2 * half + 1)
+    places = torch.bincount(index[inside], weights=away[inside], minlength=2 * half + 1)
     known = torch.nonzero(count).flatten()
     means = total[known] / count[known]
+    off = places[known] / count[known] - (known - half) / OVERSAMPLING  # pixels do not lie evenly in their bin
+    if len(known) > 2:
+        means = means - off * torch.gradient(means, spacing=(known.double() / OVERSAMPLING,))[0]
     if len(known) == len(count):
         return means
     wanted = torch.arange(len(count))
@@ -211,22 +215,27 @@ def _edge_spread(image: Tensor, offset: float, slope: float) -> Tensor:
     return means[right - 1] + share * (means[right] - means[right - 1])
 
 
-def _check_single(spread: Tensor) -> None:
+def _coarse_steps(image: Tensor, offset: float, slope: float) -> Tensor:
+    """Steps between bins of two pixels across the edge, over all of the picture that half of the rows reach."""
+    rows, columns = (torch.arange(n, dtype=torch.float64) for n in image.shape)
+    index = torch.floor((columns - (offset + slope * rows)[:, None]) / 2).long()
+    index = (index - index.min()).flatten()
+    count = torch.bincount(index).double()
+    means = torch.bincount(index, weights=image.flatten()) / count.clamp(min=1)
+    return means[count >= len(rows)].diff()
+
+
+def _check_single(steps: Tensor) -> None:
     """ValueError for a second edge, of either sign, or for noise alone."""
-    smooth = torch.nn.functional.avg_pool1d(spread[None], 9, 1, 4)[0]  # over two pixels
-    smooth = smooth * torch.sign(smooth[smooth.abs().argmax()])
-    peak = int(smooth.argmax())
-    apart, far = torch.arange(len(smooth)) - peak, None
-    for side in (apart > 0, apart < 0):
-        values = smooth[side] if bool((apart[side] > 0).any()) else smooth[side].flip(0)
+    steps = steps * torch.sign(steps[steps.abs().argmax()])
+    peak = int(steps.argmax())
+    for values in (steps[peak + 1 :], steps[:peak].flip(0)):
         if not len(values):
             continue
         lowest = torch.cummin(values, 0).values
-        again = (values > 0.3 * smooth[peak]) & (lowest < 0.5 * values)
-        if bool(again.any()) or bool((values < -0.4 * smooth[peak]).any()):
-            bad = again | (values < -0.4 * smooth[peak])
-            far = (int(torch.nonzero(bad)[0]) + 1) / OVERSAMPLING
-    if far is not None:
-        raise ValueError(
-            f"the picture has a second edge, {far:.0f} pixels from the first, or more noise than edge: cut out one."
-        )
+        again = ((values > 0.3 * steps[peak]) & (lowest < 0.5 * values)) | (values < -0.4 * steps[peak])
+        if bool(again.any()):
+            raise ValueError(
+                f"the picture has a second edge, {2 * int(torch.nonzero(again)[0]) + 2} pixels from the first, or more "
+                "noise than edge: cut out one."
+            )

@@ -48,7 +48,8 @@ def noise_power_spectrum(pictures: Tensor, *, pixel_pitch: float | None = None) 
     Example:
     >>> noise = torch.randn(8, 64, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> power = kcam.analysis.noise_power_spectrum(noise)
-    >>> abs(power.variance / float(noise.var((1, 2), correction=0).mean()) - 1) < 1e-12, round(float(power.radial.mean()))
+    >>> variance = float(noise.var((1, 2), correction=0).mean())
+    >>> abs(power.variance / variance - 1) < 1e-12, round(float(power.radial.mean()))
     (True, 1)
     """
     if not isinstance(pictures, Tensor):

@@ -115,8 +115,8 @@ class Report:
             curves += [(f"picture, {_place(key)}", one, "--") for key, one in (self.picture or {}).items()]
             axes, figure = _axes("frequency [cycles/pixel]", "contrast")
             for index, (label, one, style) in enumerate(curves):
-                colour = LINE_COLOURS[index % len(self.optics) % len(LINE_COLOURS)]
-                axes.plot(one.frequencies, one.mtf, style, color=colour, lw=1.5, label=label)
+                hue = LINE_COLOURS[index % len(self.optics) % len(LINE_COLOURS)]
+                axes.plot(one.frequencies, one.mtf, style, color=hue, lw=1.5, label=label)
             axes.axhline(0.5, color=plots.MUTED, lw=0.8, ls=":")
             axes.axvline(0.5, color=plots.MUTED, lw=0.8, ls=":")
             axes.set(xlim=(0, 0.8), ylim=(0, 1.25))
@@ -141,7 +141,7 @@ class Report:
                 axes, figure = _axes("from the axis [mm]", unit)
                 many = np.atleast_2d(pair[1].numpy())
                 for index, row in enumerate(many):
-                    colour = plots.INK if len(many) != 3 else plots.CHANNEL_COLOURS[index]
+                    colour: Any = plots.INK if len(many) != 3 else plots.CHANNEL_COLOURS[index]
                     axes.plot(pair[0] / mm, row, "o-", color=colour, ms=3.5)
                 shown.append((title, figure))
         if self.noise_power is not None:
@@ -196,7 +196,7 @@ def report(
     >>> found = kcam.analysis.report(Camera.phone())
     >>> found.save("report.html")
     >>> round(found.dynamic_range.decibels), sorted(found.missing)
-    (68, ['distortion', 'shading'])
+    (67, ['distortion', 'shading'])
     """
     if not isinstance(camera, Camera):
         raise TypeError(f"a report is of a Camera, got {type(camera).__name__}. Use Camera(*stages).")

@@ -31,7 +31,7 @@ def report(
             files.check_other(json, out)
         shape = None
         if size:
-            match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", size)
+            match = re.fullmatch(r"\s*(\d+)\s*[x,]\s*(\d+)\s*", size)
             if not match or not int(match[1]) * int(match[2]):
                 raise ValueError(f'size "{size}" is no height x width in pixels: expected e.g. --size 3000x4000.')
             shape = (int(match[1]), int(match[2]))
