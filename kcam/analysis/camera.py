@@ -416,7 +416,7 @@ def colour_error(camera: Camera, illuminants: Sequence[str] = LIGHTS) -> list[Co
     """How far the colours of the chart's 24 patches are from what the eye sees, under each light.
 
     The patches are even fields without noise; white balance and colour matrix follow the light as the camera's stages
-    do; a fixed exposure time is made up for by the light. What should be is the observer's colour under that light, adapted to D65 by Bradford's matrix.
+    do. What should be is the observer's colour under that light, adapted to D65 by Bradford's matrix.
 
     Args:      illuminants: names of `spectral.illuminant_names()`.
     Returns:   a `ColourError` for each.
@@ -430,17 +430,19 @@ def colour_error(camera: Camera, illuminants: Sequence[str] = LIGHTS) -> list[Co
     from skimage.color import deltaE_ciede2000, xyz2lab
 
     after, grid, found = _behind(camera).noiseless(), camera.resolve().wavelengths, []
-    daylight, level, exposure = spectral.xyz_weights(grid, "D65").sum(0), 1.0, _stage(camera, sensor.Exposure)
-    if exposure is not None and exposure.time is not None:  # exposed as the ISP expects it: a chart is lit for that
-        dark, rise = _response(camera)
-        level = float(camera.resolve().white_share) * (1 - dark) / rise
+    daylight, stages = spectral.xyz_weights(grid, "D65").sum(0), []
+    for stage in after:  # a fixed time is made up for by the light: the chart is lit as the ISP expects it
+        timed = isinstance(stage, sensor.Exposure) and stage.time is not None
+        iso = stage.iso if timed else None
+        stages.append(sensor.Exposure(stage.white_share, iso=iso) if timed else stage)  # type: ignore[arg-type]
+    after = Camera(*stages, context=after.resolve())
     for name in illuminants:
         light = spectral.illuminant(name, wavelengths=grid)
         patches = spectral.reflectances(grid)
         side = 56
         # 24 even fields side by side would bleed into each other: each is a picture
         scene = Scene(
-            level * torch.eye(24)[:, :, None, None].expand(24, 24, side, side).contiguous(),
+            torch.eye(24)[:, :, None, None].expand(24, 24, side, side).contiguous(),
             patches * light,
             grid,
             2.0,
