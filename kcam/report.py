@@ -304,17 +304,26 @@ def write_report(
     figures: Sequence[tuple[str, Figure]],
     advice: Sequence[str] = (),
     notes: Sequence[str] = (),
+    table: Sequence[Sequence[str]] = (),
 ) -> None:
     """Write a page that holds all it shows: one HTML file without scripts and without links to other places.
 
     Args:      path: ends in .html; replaced if it exists, whole or not at all.
                summary: (name, value). figures: (title, figure). advice: what the run warned of. notes: paragraphs.
+               table: rows below the summary, the first of them the heads; the first cell of each names it.
     Raises:    ValueError for another suffix, a folder of that name, or no place for it: see `plots.check_writable`.
     """
     plots.check_writable(path, suffixes=(".html",))
     facts = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in summary)
     warned = "".join(f"<li>{escape(text)}</li>" for text in advice)
     parts = [f"<h1>{escape(title)}</h1>", f"<dl>{facts}</dl>"]
+    if table:
+        heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table[0])
+        rows = "".join(
+            f'<tr><th scope="row">{escape(name)}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>'
+            for name, *cells in table[1:]
+        )
+        parts.append(f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>")
     if advice:
         parts.append(f'<section class="advice"><h2>Advice</h2><ul>{warned}</ul></section>')
     parts += [_figure_html(name, figure) for name, figure in figures]
@@ -350,6 +359,10 @@ dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(10rem,1fr));gap:.8
 dl>div{border-top:1px solid var(--line);padding-top:.4rem}
 dt{color:var(--muted);font-size:.85rem}
 dd{margin:0;font-variant-numeric:tabular-nums}
+table{border-collapse:collapse;width:100%;margin-top:1.5rem;font-size:.9rem}
+th,td{text-align:left;vertical-align:top;padding:.35rem .6rem .35rem 0;border-bottom:1px solid var(--line)}
+th{font-weight:600}
+td{font-variant-numeric:tabular-nums}
 .advice{background:var(--warm);border-left:4px solid var(--edge);border-radius:4px;padding:.8rem 1rem;margin-top:1.5rem}
 .advice h2{margin:0}
 .advice ul{margin:.4rem 0 0;padding-left:1.1rem}

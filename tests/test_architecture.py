@@ -33,7 +33,7 @@ LAYERS = [
     {"kcam.tradeoff"},
     {"kcam.plots"},
     {"kcam.report"},
-    {"kcam.calibration"},
+    {"kcam.calibration", "kcam.analysis"},
     {"kcam.demo", "kcam.shoot", "kcam.train"},
     {"kcam.cli"},
     {"kcam.__main__"},

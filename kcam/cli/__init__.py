@@ -19,6 +19,7 @@ from kcam import __version__, memory
 from kcam.cli.calibration import calibrate_sensor
 from kcam.cli.console import complain, err, losses, one_line_errors, progress
 from kcam.cli.data import app as data_app
+from kcam.cli.report import report
 
 if TYPE_CHECKING:
     from kcam.camera import Camera
@@ -34,6 +35,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # "rich" would take [pixels] for a style, and drop it
 )
 app.add_typer(data_app, name="data")
+app.command()(report)
 
 TOLERANCE = 'simulate only what is needed for this error of the raw: 0.01, or "sensor"; 0: the reference physics'
 FeaturesOption = Annotated[str, typer.Option("--features", help="steerable, or vgg16 with --vgg-weights")]
