@@ -1,4 +1,4 @@
-"""From the raw picture to the finished one: demosaic, white balance, colour matrix, tone curve, style."""
+"""From the raw picture to the finished one: demosaic, denoise, white balance, colour, tones, style, JPEG."""
 
 from kcam.isp.colour import (
     Clip,
@@ -22,16 +22,22 @@ from kcam.isp.demosaic import (
     demosaic,
     learned_demosaic,
 )
+from kcam.isp.denoise import Denoise, denoise
+from kcam.isp.finish import JPEG, LocalToneMapping, Sharpen, jpeg, map_tones_locally, sharpen
 from kcam.isp.style_stage import StyleStage
 
 __all__ = [
     "DEMOSAICS",
+    "JPEG",
     "Clip",
     "ColourMatrix",
     "Convolution",
     "Demosaic",
     "DemosaicMethod",
+    "Denoise",
     "LearnedDemosaic",
+    "LocalToneMapping",
+    "Sharpen",
     "StyleStage",
     "ToneCurve",
     "WhiteBalance",
@@ -40,9 +46,13 @@ __all__ = [
     "as_shot_gains",
     "convolve_planes",
     "demosaic",
+    "denoise",
     "fit_colour_matrix",
+    "jpeg",
     "learned_demosaic",
+    "map_tones_locally",
     "render_tones",
+    "sharpen",
     "tone_curve",
     "white_balance",
 ]
