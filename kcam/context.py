@@ -56,7 +56,8 @@ class Context:
         lens, pixel_pitch [m], fill_factor: the optics, for photometry.
         colour_filter: the filter whose curves white balance, exposure and colour matrix use.
         pattern: name of the mosaic.
-        full_well, read_noise [electrons], gain (analogue, 1 at base ISO), white_share (of full scale), black_level (of full scale).
+        full_well, read_noise [electrons], gain (analogue, 1 at base ISO),
+        white_share (of full scale), black_level (of full scale).
 
     Example:
     >>> context = kcam.Context()

@@ -219,11 +219,13 @@ def jpeg(signal: Tensor, *, quality: int = 90) -> Tensor:
     if signal.shape[1] == 1:
         return gray / 255
     height, width = signal.shape[-2:]
+    uneven = signal.new_tensor([-1 / 8, 1 / 8]).repeat(width // 4 + 8)  # libjpeg rounds halves down, then up
     colour = []
     for channel, weight in ((2, 1.772), (0, 1.402)):
         full = round_ste((levels[:, channel : channel + 1] - _gray(levels, LUMA)) / weight)
-        half = round_ste(F.avg_pool2d(F.pad(full, (0, width % 2, 0, height % 2), mode="replicate"), 2))
-        half = clip_ste(round_ste(_through_blocks(half, tables[1])), -128.0, 127.0)
+        half = F.avg_pool2d(F.pad(full, (0, -width % 16, 0, height % 2), mode="replicate"), 2)
+        half = round_ste(half + uneven[: half.shape[-1]])
+        half = clip_ste(round_ste(_through_blocks(half, tables[1])), -128.0, 127.0)[..., : (width + 1) // 2]
         double = F.interpolate(half, scale_factor=2, mode="bilinear")[..., :height, :width]
         colour.append(round_ste(double))
     blue, red = colour
