@@ -75,7 +75,8 @@ def test_local_tone_mapping_keeps_hue_white_and_range():
     mapped = isp.map_tones_locally(picture, strength=0.5)
     ratio = mapped / picture.clamp(min=1e-6)
     assert (ratio.amax(1) - ratio.amin(1)).abs().max() < 1e-3
-    assert mapped.min() >= 0 and mapped.max() <= 1 + 1e-6
+    assert mapped.min() >= 0
+    assert mapped.max() <= 1 + 1e-6
     white = torch.ones(1, 3, 9, 9)
     torch.testing.assert_close(isp.map_tones_locally(white), white)
 
@@ -92,7 +93,9 @@ def test_a_flat_region_is_brightened_by_the_closed_form(level):
 @pytest.mark.parametrize("shape", [(0, 3, 4, 4), (1, 1, 1, 1), (2, 3, 1, 1), (2, 1, 5, 4)])
 def test_small_pictures_and_none(stage, shape):
     result = stage(torch.full(shape, 0.4).half())
-    assert result.shape == shape and result.dtype == torch.half and bool(result.isfinite().all())
+    assert result.shape == shape
+    assert result.dtype == torch.half
+    assert bool(result.isfinite().all())
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: type(stage).__name__)
