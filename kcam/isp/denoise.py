@@ -88,11 +88,11 @@ def denoise(
     rows = max(STRIP // (signal.shape[0] * signal.shape[-1]), 1)
     strips = []
     for top in range(0, signal.shape[-2], rows):
-        pieces = [values[..., top : top + rows + 2 * radius, :] for values in wide]
+        part, guide_part = (values[..., top : top + rows + 2 * radius, :] for values in wide)
         if torch.is_grad_enabled() and wide[0].requires_grad:
-            strips.append(checkpoint(_strip, *pieces, radius, luma, chroma, use_reentrant=False))
+            strips.append(checkpoint(_strip, part, guide_part, radius, luma, chroma, use_reentrant=False))
         else:
-            strips.append(_strip(*pieces, radius, luma, chroma))
+            strips.append(_strip(part, guide_part, radius, luma, chroma))
     return torch.cat(strips, -2) / balance
 
 

@@ -85,8 +85,8 @@ def test_the_camera_tells_its_noise_and_two_read_noises_add_up():
 
 def test_a_saved_camera_denoises_alike(tmp_path):
     camera = Camera.phone_lens()
-    camera.save(tmp_path / "camera.pt")
-    loaded = Camera.load(tmp_path / "camera.pt")
+    camera.save(tmp_path / "camera.safetensors")
+    loaded = Camera.load(tmp_path / "camera.safetensors")
     assert [type(stage) for stage in loaded] == [type(stage) for stage in camera]
 
 
