@@ -61,6 +61,7 @@ def results_link(path: Path) -> str:
     """A link from a page of the site to a file of results."""
     return f"[`{path.name}`](../../{path.relative_to(ROOT)})"
 
+
 # ---- the propagators -------------------------------------------------------------------------------------------------
 
 

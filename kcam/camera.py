@@ -82,6 +82,9 @@ class Camera(nn.Module):
         for index, stage in enumerate(self.stages):
             for name, value in stage.provides().items() if isinstance(stage, Stage) else ():
                 here = f"{type(stage).__name__} (stage {index})"
+                if name == "read_noise" and name in given:  # independent noises add up, they do not contradict
+                    given[name] = ((value**2 + given[name][0] ** 2) ** 0.5, here)
+                    continue
                 other, there = given.setdefault(name, (value, here))
                 if not _same(value, other):
                     raise ValueError(
@@ -372,7 +375,9 @@ class Camera(nn.Module):
         "phone") in focus at 2 m, 0.9 um pixels; the lens reaches as far as 4000 x 3000 of them.
         """
         lens = optics.CompoundLens.preset("phone", focus_distance=2.0)
-        return Camera(optics.Imaging(lens, pixel_pitch=0.9 * um), *_rgb_sensor(full_well=4_500, read_noise=1.5))
+        *taken, demosaic, balance, matrix, tones = _rgb_sensor(full_well=4_500, read_noise=1.5)
+        developed = [demosaic, isp.Denoise(), balance, matrix, isp.LocalToneMapping(), tones, isp.Sharpen(), isp.JPEG()]
+        return Camera(optics.Imaging(lens, pixel_pitch=0.9 * um), *taken, *developed)
 
     @staticmethod
     def slr() -> Camera:

@@ -58,7 +58,8 @@ class Context:
         exposure_time [s], or None where nobody says.
         colour_filter: the filter whose curves white balance, exposure and colour matrix use.
         pattern: name of the mosaic.
-        full_well [electrons], gain (analogue, 1 at base ISO), white_share (of full scale), black_level (of full scale).
+        full_well, read_noise [electrons], gain (analogue, 1 at base ISO),
+        white_share (of full scale), black_level (of full scale).
 
     Example:
     >>> context = kcam.Context()
@@ -78,6 +79,7 @@ class Context:
     colour_filter: Curves | None = None
     pattern: str = "RGGB"
     full_well: float = 10_000.0
+    read_noise: float = 0.0
     gain: float = 1.0
     white_share: float = 0.8
     black_level: float = 0.0

@@ -24,7 +24,8 @@ import kcam
 
 MODULES = (
     "kcam", "kcam.optics", "kcam.sensor", "kcam.isp", "kcam.augmentation", "kcam.data", "kcam.style", "kcam.planner",
-    "kcam.tradeoff", "kcam.plots", "kcam.calibration", "kcam.analysis", "kcam.spectral", "kcam.files", "kcam.units", "kcam.effects", "kcam.measure",
+    "kcam.tradeoff", "kcam.plots", "kcam.calibration", "kcam.analysis", "kcam.spectral", "kcam.files", "kcam.units",
+    "kcam.effects", "kcam.measure",
 )  # fmt: skip
 """Those of the reference."""
 

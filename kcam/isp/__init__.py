@@ -1,4 +1,4 @@
-"""From the raw picture to the finished one: demosaic, white balance, colour matrix, tone curve, style."""
+"""From the raw picture to the finished one: demosaic, denoise, white balance, colour, tones, style, JPEG."""
 
 from kcam.isp.colour import (
     Clip,
@@ -22,17 +22,23 @@ from kcam.isp.demosaic import (
     demosaic,
     learned_demosaic,
 )
+from kcam.isp.denoise import Denoise, denoise
+from kcam.isp.finish import JPEG, LocalToneMapping, Sharpen, jpeg, map_tones_locally, sharpen
 from kcam.isp.raw import develop
 from kcam.isp.style_stage import StyleStage
 
 __all__ = [
     "DEMOSAICS",
+    "JPEG",
     "Clip",
     "ColourMatrix",
     "Convolution",
     "Demosaic",
     "DemosaicMethod",
+    "Denoise",
     "LearnedDemosaic",
+    "LocalToneMapping",
+    "Sharpen",
     "StyleStage",
     "ToneCurve",
     "WhiteBalance",
@@ -41,10 +47,14 @@ __all__ = [
     "as_shot_gains",
     "convolve_planes",
     "demosaic",
+    "denoise",
     "develop",
     "fit_colour_matrix",
+    "jpeg",
     "learned_demosaic",
+    "map_tones_locally",
     "render_tones",
+    "sharpen",
     "tone_curve",
     "white_balance",
 ]

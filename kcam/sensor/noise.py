@@ -468,6 +468,10 @@ class ReadNoise(RandomStage):
         full_well, _ = self._resolve(context, None)
         return like(self.sigma_electrons, signal) / like(full_well, signal)
 
+    def provides(self) -> dict[str, Any]:
+        """The read noise, for the denoising, and what every noise provides."""
+        return {**super().provides(), "read_noise": self.sigma_electrons}
+
 
 class DarkCurrent(RandomStage):
     """Thermal electrons in every pixel: `dark_current`. Its mean adds their expected number.
