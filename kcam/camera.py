@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from kcam.planner import Plan
 
 DEMOSAICING = (isp.Demosaic, isp.LearnedDemosaic)
-DEVELOPING = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve)
+FINISHING = (isp.Denoise, isp.LocalToneMapping, isp.Sharpen, isp.JPEG)
+DEVELOPING = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve, *FINISHING)
 """The first of these ends the raw signal."""
 ORDER: tuple[type[nn.Module] | tuple[type[nn.Module], ...], ...] = (
     optics.Imaging,

@@ -221,7 +221,6 @@ AUGMENTATIONS: dict[str, Door] = {
         "RandomShotReadNoise": KC.RandomShotReadNoise(p=1.0),
         "RandomFixedPattern": KC.RandomFixedPattern(p=1.0),
         "RandomMotion": KC.RandomMotion(p=1.0),
-        "RandomRollingShutter": KC.RandomRollingShutter(p=1.0),
         "RandomBanding": KC.RandomBanding(p=1.0),
         "RandomHotPixels": KC.RandomHotPixels(p=1.0),
         "RandomVeilingGlare": KC.RandomVeilingGlare(p=1.0),
@@ -236,6 +235,7 @@ AUGMENTATIONS: dict[str, Door] = {
 }
 AUGMENTATIONS |= {
     "RandomLensDistortion": Door(KC.RandomLensDistortion(p=1.0), SCALED | {"alpha"}),
+    "RandomRollingShutter": Door(KC.RandomRollingShutter(p=1.0), SCALED | {"alpha"}),
     "CameraSequential": Door(
         KC.CameraSequential(KC.RandomExposure(p=1.0)),
         ARRAYS,

@@ -27,7 +27,7 @@ from kcam import cli, demo, isp, optics, sensor
 from kcam.camera import PRESETS
 from kcam.scene import BUILTIN
 from kcam.sensor.colour_filter import fitted
-from kcam.units import mm, um
+from kcam.units import mm, nm, um
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -423,7 +423,7 @@ def test_bounds_in_the_two_tables_are_those_of_the_tests() -> None:
 def test_stages_in_the_table_are_stages() -> None:
     lens = optics.Lens(optics.CircularAperture(1e-3), optics.ThinLens(1e-2), focus_distance=1.0)
     rows = re.findall(r"^\| `((?:optics|sensor|isp)\..*?)` \|", page("understand/camera"), re.MULTILINE)
-    names = {"optics": optics, "sensor": sensor, "isp": isp, "lens": lens, "um": um}
+    names = {"optics": optics, "sensor": sensor, "isp": isp, "lens": lens, "um": um, "nm": nm, "torch": torch}
     stages = [eval(row, names) for row in rows]
     assert all(isinstance(stage, kcam.Stage) for stage in stages)
     public = {

@@ -308,7 +308,8 @@ class Plan:
 
     def to_json(self) -> str:
         """The plan as text; numbers come back as they were."""
-        return json.dumps(asdict(self), indent=1)
+        found = asdict(self)
+        return json.dumps(found if self.replaced else {k: v for k, v in found.items() if k != "replaced"}, indent=1)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Plan:

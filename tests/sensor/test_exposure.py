@@ -133,7 +133,7 @@ def test_stopping_down_costs_photons_and_iso_does_not_change_them():
     assert fill(luminance=2000.0) == pytest.approx(2 * one)
     assert fill(pixel_pitch=2 * um) == pytest.approx(one / 4)
     assert fill(full_well=20_000.0) == pytest.approx(one / 2)
-    assert Exposure(time=0.01, iso=800).provides() == {"gain": 8.0}
+    assert Exposure(time=0.01, iso=800).provides() == {"gain": 8.0, "exposure_time": 0.01}
 
 
 def test_the_constants_are_those_of_the_tables():
@@ -177,8 +177,9 @@ def test_a_filter_that_sees_nothing_gives_finite_values():
 def test_arguments_are_attributes_and_dtype_is_kept():
     one = Exposure(0.7, time=0.01, iso=200, quantum_efficiency=0.6)
     arguments = {key: getattr(one, key) for key in inspect.signature(Exposure).parameters}
-    assert arguments == {"white_share": 0.7, "time": 0.01, "iso": 200, "quantum_efficiency": 0.6}
-    assert one.provides() == {"gain": 2.0, "white_share": 0.7}
+    told = {"white_share": 0.7, "time": 0.01, "iso": 200, "quantum_efficiency": 0.6, "compensation": None}
+    assert arguments == told
+    assert one.provides() == {"gain": 2.0, "exposure_time": 0.01, "white_share": 0.7}
     assert Exposure().provides() == {}
     for dtype in (torch.float16, torch.float32, torch.float64):
         assert Exposure()(torch.rand(1, 1, 3, 5, dtype=dtype)).dtype == dtype

@@ -117,7 +117,7 @@ def test_each_estimate_is_near_what_leaving_it_out_does_to_the_raw(seed: int) ->
         for index, stage in enumerate(shot):
             effect = type(stage).__name__
             if effect in COUNTED:
-                change = relative_rms(noiseless_raw(shortened(shot, {}, [index]))(light), raw)
+                change = relative_rms(noiseless_raw(shortened(shot, {}, {index: None}))(light), raw)
                 estimate = stage.error_if_skipped(dict(signals(shot, light))[index], shot.resolve(light))
                 # behind it light is cut off, bent and weighed by where it is recorded
                 assert change / 2 <= estimate <= 2 * change, effect  # both may be 0: no pixel of these is a defect
