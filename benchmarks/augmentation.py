@@ -526,7 +526,7 @@ def half_of_the_rows(batch: int) -> int:
 
 def simulate(augmentation: Any, signal: Tensor, drawn: dict[str, Tensor]) -> Tensor:
     """The effect alone."""
-    if isinstance(augmentation, KC.RandomLensDistortion):
+    if isinstance(augmentation, (KC.RandomLensDistortion, KC.RandomRollingShutter)):
         return augmentation._remapped(signal, drawn, augmentation.flags, inverse=False)
     return augmentation.simulate(signal, drawn)
 

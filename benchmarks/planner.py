@@ -1,6 +1,9 @@
 """Whether plans keep their word: random pairs of camera and scene, planned at five tolerances and measured.
 
-    python -m benchmarks.planner [--random 300] [--hard 100] [--adversarial 200] [--start 0] [--out FILE.json]
+    python -m benchmarks.planner [--random 300] [--hard 100] [--adversarial 200] [--start 0] [--out FILE] [--effects]
+
+With --effects the same pairs have one to four effects of a sensor's light drawn into them (glare, motion, crosstalk,
+defects, ...), and only whether plans keep their word is measured.
 
 It goes on where it stopped: pairs that are in the file of partial results are not measured again. Each pair follows
 from its seed alone. A pair whose reference would take more than `LONGEST` is drawn again, and counted. Hard pairs are
@@ -26,7 +29,7 @@ from torch import Tensor
 
 from kcam import Camera, Scene, isp, measure, optics, sensor
 from kcam.optics.compound.presets import PRESETS
-from kcam.planner import Planner, costs, make_plan, relative_rms, timed
+from kcam.planner import Planner, costs, make_plan, noiseless_raw, relative_rms, timed
 from kcam.planner.planner import fresh
 from kcam.units import mm, um, wavelength_grid
 
@@ -37,6 +40,7 @@ FIRST = (0.03, 0.01)  # tolerances at which the first picture is timed too: a pl
 SEEN, FELT = 0.1, 0.3  # seconds of a reference picture from which on the worst, and the median, of first pictures count
 SIDES = (48, 64, 96, 128, 160, 192)
 RESULTS = Path(__file__).parent / "results" / "planner.json"
+EFFECTS = RESULTS.with_name("planner_effects.json")
 
 
 # ---- random pairs --------------------------------------------------------------------------------------------------
@@ -333,6 +337,81 @@ def measured_psfs(draw: random.Random, generator: torch.Generator) -> tuple[opti
     return found, f"measured PSFs of {side} px, {count} wavelengths, {layers} distances, {places} places"
 
 
+# ---- effects -------------------------------------------------------------------------------------------------------
+
+
+def with_effects(camera: Camera, scene: Scene, seed: str) -> tuple[Camera, str]:
+    """The camera with one to four of the effects that light and a sensor may have, from hardly any to too much."""
+    draw = random.Random(f"effects/{seed}")
+    chosen = draw.sample(sorted(INSERTS), draw.randint(1, 4))
+    stages, named = list(camera), []
+    for name in chosen:
+        stage = INSERTS[name](draw, scene)
+        place = _place(stages, stage)
+        if place is not None:
+            stages.insert(place, stage)
+            named.append(name)
+    return Camera(*stages, context=camera.context), " + ".join(named) or "no effect that fits"
+
+
+def _much(draw: random.Random, low: float, high: float) -> float:
+    return math.exp(draw.uniform(math.log(low), math.log(high)))
+
+
+def _random_motion(draw: random.Random, scene: Scene) -> sensor.Motion:
+    time, readout = 0.01, draw.choice([0.0, 0.0, 0.02])
+    pixels, angle = _much(draw, 0.02, 12) / (time + readout), draw.uniform(0, 2 * math.pi)
+    velocity = pixels * math.cos(angle), pixels * math.sin(angle)
+    kind = draw.choice(["velocity", "path", "flow"])
+    if kind == "velocity":
+        return sensor.Motion(velocity, time=time, readout=readout)
+    if kind == "path":
+        path = sensor.tremor(time + readout, seed=draw.randrange(1000), count=9)
+        return sensor.Motion(path=path / path.abs().max() * pixels * (time + readout), time=time, readout=readout)
+    generator = torch.Generator().manual_seed(draw.randrange(2**31))
+    fields = [smooth_field((scene.shape[1], scene.shape[2]), scale=2, generator=generator) - 0.5 for _ in range(2)]
+    return sensor.Motion(flow=2 * pixels * torch.stack(fields).float(), time=time, readout=readout)
+
+
+def _random_glass(draw: random.Random, scene: Scene) -> sensor.Transmission:
+    nodes = torch.linspace(400e-9, 740e-9, 6, dtype=torch.float64)
+    return sensor.Transmission(nodes, torch.tensor([draw.uniform(0.05, 1) for _ in range(6)]))
+
+
+INSERTS: dict[str, Callable[[random.Random, Scene], torch.nn.Module]] = {
+    "glass": _random_glass,
+    "glare": lambda draw, _: optics.VeilingGlare(
+        _much(draw, 1e-3, 0.1), core=_much(draw, 1e-3, 0.02), slope=draw.uniform(1.5, 2.5), focal_length=50 * mm
+    ),
+    "shading": lambda draw, _: sensor.MicrolensShading(draw.uniform(0.05, 0.8), pupil_distance=_much(draw, 1, 50) * mm),
+    "motion": _random_motion,
+    "crosstalk": lambda draw, _: sensor.Crosstalk(_much(draw, 1e-4, 0.1), electrical=_much(draw, 1e-4, 0.1)),
+    "defects": lambda draw, _: sensor.DefectPixels(_much(draw, 1e-5, 1e-2), dead=_much(draw, 1e-5, 1e-2)),
+    "banding": lambda draw, _: sensor.RowColumnNoise(_much(draw, 0.1, 30), fixed_column=_much(draw, 0.1, 30)),
+    "bend": lambda draw, _: sensor.Nonlinearity(draw.choice([-1, 1]) * _much(draw, 1e-4, 0.1)),
+}
+"""What is drawn into a camera, by name."""
+
+
+def _place(stages: Sequence[torch.nn.Module], stage: torch.nn.Module) -> int | None:
+    """Where it belongs; None where a camera has no place for it."""
+
+    def first(*kinds: type) -> int | None:
+        return next((index for index, one in enumerate(stages) if isinstance(one, kinds)), None)
+
+    colours, tile = first(sensor.ColourFilter), first(sensor.Mosaic) is None
+    if isinstance(stage, sensor.Transmission):
+        return colours
+    if isinstance(stage, (optics.VeilingGlare, sensor.Motion, sensor.MicrolensShading)):
+        return None if colours is None or tile else colours + 1
+    if isinstance(stage, sensor.Crosstalk):
+        mosaic = first(sensor.Mosaic)
+        return None if mosaic is None else mosaic + 1
+    if isinstance(stage, sensor.DefectPixels):
+        return first(sensor.ShotNoise, isp.Clip)
+    return first(sensor.ADC, isp.Clip)
+
+
 LATER = (
     ("moved", "exposed a little", "noisy", "mirrored", "alone"),
     ("exposed", "photograph", "colours", "narrow band", "lamp", "contrast", "depth", "noise", "flat"),
@@ -472,6 +551,47 @@ def measure_pair(
     return {"seed": f"{kind} {seed}", "pair": text, "drawn_again": again, "tolerances": rows}
 
 
+def honest_pair(kind: str, seed: int) -> dict[str, Any]:
+    """One pair with effects: for each tolerance the estimate and the truth, the worst of the batch and of its items."""
+    camera, scene, text, _ = PAIRS[kind](seed)
+    camera, effects = with_effects(camera, scene, f"{kind}/{seed}")
+    rows = []
+    with torch.no_grad():
+        planner, truth = Planner(camera, scene), noiseless_raw(camera)(scene)
+        for tolerance in TOLERANCES:
+            plan = planner.plan(tolerance)
+            raw = noiseless_raw(plan.apply(camera))(scene)
+            error = max(relative_rms(a, b) for a, b in [(raw, truth), *zip(raw, truth, strict=True)])
+            left_out = [row.effect for row in plan.decisions if row.chosen == "left out"]
+            rows.append({"tolerance": tolerance, "bound": plan.bound, "error": error, "left_out": left_out})
+    return {"seed": f"{kind} {seed}", "pair": f"{effects}; {text}", "tolerances": rows}
+
+
+def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
+    """All pairs with effects; goes on where it stopped."""
+    partial = out.with_suffix(".partial.jsonl")
+    known = [json.loads(line) for line in partial.read_text().splitlines()] if partial.exists() else []
+    done = {pair["seed"]: pair for pair in known}
+    for kind, seed in [(kind, seed) for kind, own in seeds.items() for seed in own]:
+        if f"{kind} {seed}" not in done:
+            found = done[f"{kind} {seed}"] = honest_pair(kind, seed)
+            with partial.open("a") as file:
+                file.write(json.dumps(found) + "\n")
+            worst = max(row["error"] / row["tolerance"] for row in found["tolerances"])
+            print(f"{found['seed']}: {found['pair']}: worst {worst:.2f} of the tolerance", flush=True)
+    content: dict[str, Any] = {"environment": measure.environment()}
+    for kind, own in seeds.items():
+        rows = [row for seed in own for row in done[f"{kind} {seed}"]["tolerances"]]
+        content[kind] = {
+            "pairs": len(own),
+            "outside": sum(row["error"] > row["tolerance"] for row in rows),
+            "worst": max((row["error"] / row["tolerance"] for row in rows), default=0.0),
+            "all": [done[f"{kind} {seed}"] for seed in own],
+        }
+        print(kind, {name: value for name, value in content[kind].items() if name != "all"})
+    measure.write_json(out, content)
+
+
 def _whole(camera: Camera, scene: Scene, **how: Any) -> float:
     """Seconds of a whole picture with new optics, planning included where there is a tolerance."""
     new = Camera(*(fresh(stage) for stage in camera), context=camera.context)
@@ -544,14 +664,19 @@ def main() -> None:
     for kind, count in COUNTS.items():
         parser.add_argument(f"--{kind}", type=int, default=count)
     parser.add_argument("--start", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, default=None)
+    parser.add_argument("--effects", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    seeds = {kind: range(arguments.start, arguments.start + getattr(arguments, kind)) for kind in COUNTS}
+    if arguments.effects:
+        measure_effects(seeds, arguments.out or EFFECTS)
+        return
+    arguments.out = arguments.out or RESULTS
     partial = arguments.out.with_suffix(".partial.jsonl")
     known = [json.loads(line) for line in partial.read_text().splitlines()] if partial.exists() else []
     done = {pair["seed"]: pair for pair in known}
     rates, _ = costs.calibrate()
-    seeds = {kind: range(arguments.start, arguments.start + getattr(arguments, kind)) for kind in COUNTS}
     for kind, seed in [(kind, seed) for kind, own in seeds.items() for seed in own]:
         key = f"{kind} {seed}"
         if key not in done:

@@ -498,7 +498,7 @@ AUGMENTED, SEGMENTED = RESULTS / "augmentation.json", RESULTS / "augmentation_tr
 
 def augmentations() -> list[type]:
     """Every augmentation, from the scene to the picture."""
-    order = ("optics", "geometry", "lens", "sensor", "isp", "camera")
+    order = ("optics", "geometry", "motion", "lens", "sensor", "isp", "camera")
     found = [
         value
         for value in vars(KC).values()
