@@ -621,16 +621,11 @@ TARGETS = (
     Target("trainable DOE: >= 8 times faster", "DOE", 8),
     Target("DOE, 1 distance, points: >= 10 times faster", "DOE, 1 distance, points", 10, direction="forward"),
     Target(
-        "DOE, 1 distance, points, with gradient: >= 12 times faster",
-        "DOE, 1 distance, points",
-        12,
+        "DOE, 1 distance, points, with gradient: >= 12 times faster", "DOE, 1 distance, points", 12,
         direction="forward + backward",
     ),
     Target(
-        "nonparaxial with a DOE: <= 1.3 times as long as fresnel",
-        "DOE",
-        1 / 1.3,
-        who="kcam nonparaxial matrix",
+        "nonparaxial with a DOE: <= 1.3 times as long as fresnel", "DOE", 1 / 1.3, who="kcam nonparaxial matrix",
         than="kcam fresnel matrix",
     ),
     Target("full-rank cube: <= 1.3 times as long as its bare FFTs", "render cube", 1 / 1.3, than="bare FFTs"),

@@ -61,7 +61,6 @@ def results_link(path: Path) -> str:
     """A link from a page of the site to a file of results."""
     return f"[`{path.name}`](../../{path.relative_to(ROOT)})"
 
-
 # ---- the propagators -------------------------------------------------------------------------------------------------
 
 
@@ -1050,7 +1049,7 @@ def augmentation_gallery(path: Path) -> None:
     sys.path.insert(0, str(ROOT / "examples"))
     import augmentation_gallery as example
 
-    save_jpeg(example.figure(example.gallery(), example.original()[0]), path, resolutions=(165,))  # noise is bulky
+    save_jpeg(example.figure(example.gallery(), example.original()[0]), path, resolutions=(165, 140, 120))  # noise is bulky
 
 
 PLOTS = {"peers.png": RESULTS / "peers.json", "field-growth.png": FIELD} | {

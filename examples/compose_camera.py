@@ -1,6 +1,6 @@
 """Compose cameras from stages, look at what each stage hands on, save one and load it again.
 
-python examples/compose_camera.py [--size 240] [--out cameras.png]
+    python examples/compose_camera.py [--size 240] [--out cameras.png]
 """
 
 from __future__ import annotations

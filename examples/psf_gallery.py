@@ -1,6 +1,6 @@
 """A gallery of PSFs: what each element does to a point of light, from near focus to far.
 
-python examples/psf_gallery.py [--out psf_gallery.png]
+    python examples/psf_gallery.py [--out psf_gallery.png]
 """
 
 from __future__ import annotations

@@ -37,6 +37,8 @@ def of_plan(plan: Plan) -> Answer:
     for row in rows:
         row.pop("why")  # the same numbers in words
     plain["range"].pop("contrast")
+    if not plain["replaced"]:  # of stages that have cheaper forms, which came later
+        plain.pop("replaced")
     if not plain["range"]["rings"]:  # of optics that vary over the picture, which came later
         plain["range"].pop("rings")
     seen = plain["range"].pop("potential"), plain["range"].pop("light"), plain["range"].pop("depths")

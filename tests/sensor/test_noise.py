@@ -227,8 +227,8 @@ def test_full_well_comes_from_the_context_where_open():
     signal = torch.full((1, 1, 200, 200), 0.5, dtype=torch.float64)
     small = ShotNoise()(signal, Context(full_well=100.0), generator=seeded())
     assert torch.equal(small, ShotNoise(100.0)(signal, generator=seeded()))
-    assert ShotNoise().provides() == ReadNoise().provides() == {}
-    assert ReadNoise(2.0, full_well=50.0).provides() == {"full_well": 50.0}
+    assert ShotNoise().provides() == {}
+    assert ReadNoise(2.0, full_well=50.0).provides() == {"full_well": 50.0, "read_noise": 2.0}
 
 
 def test_one_strength_per_picture():
