@@ -13,25 +13,25 @@ from kcam.isp.colour import as_shot_gains
 from kcam.sensor.noise import check_full_well, check_not_negative, hold, in_float32, like
 from kcam.units import check_positive
 
-STRIP = 2**19
-"""Pixels that are filtered at once: what bounds the memory."""
+STRIP = 2**16
+"""Pixels that are filtered at once: what bounds the memory, and stays in the processor's cache."""
 
 
 def _strip(signal: Tensor, guide: Tensor, radius: int, luma: Tensor | float, chroma: Tensor | float) -> Tensor:
     """The filter on a strip that is padded by the radius on all sides."""
     height, width = signal.shape[-2] - 2 * radius, signal.shape[-1] - 2 * radius
     centre = guide[..., radius : radius + height, radius : radius + width]
+    gray = signal.mean(1, keepdim=True)
+    colour = signal - gray
     sums: list[Tensor | float] = [0.0, 0.0, 0.0, 0.0]
     for row in range(2 * radius + 1):
         for column in range(2 * radius + 1):
             part = (..., slice(row, row + height), slice(column, column + width))
             near = ((row - radius) ** 2 + (column - radius) ** 2) / (radius + 1) ** 2
             distance = (guide[part] - centre).square().mean(1, keepdim=True)
-            values = signal[part]
-            gray = values.mean(1, keepdim=True)
             fine = torch.exp(-distance / (2 * luma**2) - near)
             coarse = torch.exp(-distance / (2 * chroma**2) - near)
-            for index, term in enumerate((fine, fine * gray, coarse, coarse * (values - gray))):
+            for index, term in enumerate((fine, fine * gray[part], coarse, coarse * colour[part])):
                 sums[index] = sums[index] + term
     return sums[1] / sums[0] + sums[3] / sums[2]  # type: ignore[return-value, operator]
 
