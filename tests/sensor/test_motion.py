@@ -193,10 +193,10 @@ class TestTranslation:
 
 def test_gradients() -> None:
     draw = Draw(0)
-    signal = draw.noise(1, 2, 6, 7).requires_grad_()
+    signal = draw.noise(1, 1, 5, 6).requires_grad_()
     velocity = torch.tensor([12.3, -7.1]).double().requires_grad_()
     path = (3 * draw.noise(3, 2)).requires_grad_()
-    flow = (10 * draw.noise(2, 6, 7) + 3).requires_grad_()
+    flow = (10 * draw.noise(2, 5, 6) + 3).requires_grad_()
     time = torch.tensor(0.11).double().requires_grad_()
     for make in (
         lambda s, v, p, f, t: Motion(v, time=t)(s),
