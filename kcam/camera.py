@@ -98,6 +98,8 @@ class Camera(nn.Module):
             fields["colour_filter"] = fields["colour_filter"].behind(*glasses)
         elif _same_curves(told, fields.get("colour_filter")):  # a part of a camera that had glasses before the filter
             fields["colour_filter"] = told
+        if self.context is not None and isinstance(fields.get("read_noise"), float):  # of a part, others are outside it
+            fields["read_noise"] = max(fields["read_noise"], float(self.context.read_noise))
         if isinstance(scene, Scene):
             fields |= {name: getattr(scene, name) for name in ("wavelengths", "illuminant", "luminance", "depth")}
         return dataclasses.replace(self.context or Context(), **fields, generator=generator)

@@ -54,8 +54,7 @@ def from_calibration(
                channel: one of the file's, such as "G", in place of the mean.
                exposure_time: of the dark current [s], > 0; None leaves dark current out.
                seed: names the sensor of the fixed pattern.
-    Returns:   stages to put behind `Exposure`: Camera(imaging, colour_filter, Mosaic("RGGB"), Exposure(),
-               *sensor.from_calibration("sensor.json"), Demosaic()).
+    Returns:   stages to put behind `Exposure`, such as of ``Camera(imaging, colour_filter, Exposure(), *stages)``.
     Raises:    FileNotFoundError; ValueError for a file that is none, an unknown channel, a time <= 0, or a time where
                the file has no dark current.
 

@@ -22,11 +22,12 @@ class Transmission(Stage):
     A camera knows of it: exposure, white balance and colour matrix see the filter behind it, and an Imaging takes both
     into its own computation.
 
-    Args:      wavelengths: (N,) of the table, rising [m]; at least two.
+    Args:      wavelengths: (N,) of the table, rising [m], at least two; or a table of one column, such as
+                   `spectral.read_csv` gives.
                values: (N,) shares of the light, 0..1, linear between the wavelengths and constant beyond their ends. An
                    nn.Parameter trains.
-    Raises:    ValueError for wavelengths out of range or that do not rise, or values of another shape, not finite, or
-               outside 0..1 (percent?); TypeError for what is no tensor.
+    Raises:    ValueError for wavelengths out of range or that do not rise, values of another shape, not finite, or
+               outside 0..1 (percent?), or a table of several columns; TypeError for what is no tensor.
     Source:    ASTM E308, for values beyond the ends of a table.
 
     Example:
@@ -38,8 +39,15 @@ class Transmission(Stage):
     wavelengths: Tensor
     values: Tensor
 
-    def __init__(self, wavelengths: Tensor, values: Tensor):
+    def __init__(self, wavelengths: Tensor | spectral.SpectralTable, values: Tensor | None = None):
         super().__init__()
+        if isinstance(wavelengths, spectral.SpectralTable):
+            if len(wavelengths.values) != 1:
+                names = ", ".join(wavelengths.names)
+                raise ValueError(
+                    f"the table has {len(wavelengths.values)} columns ({names}): expected one transmission."
+                )
+            values, wavelengths = wavelengths.values[0], wavelengths.wavelengths
         nodes = spectral.rising(wavelengths)
         if not isinstance(values, Tensor) or values.shape != nodes.shape:
             got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
@@ -63,14 +71,10 @@ class Transmission(Stage):
         >>> sensor.Transmission.from_csv("glass.csv", percent=True).values
         tensor([0.0000, 0.9200], dtype=torch.float64)
         """
-        table = spectral.read_csv(path, percent=percent)
-        if len(table.values) != 1:
-            names = ", ".join(table.names)
-            raise ValueError(f"{path} has {len(table.values)} columns ({names}): expected one transmission. Take one.")
         try:
-            return cls(table.wavelengths, table.values[0])
+            return cls(spectral.read_csv(path, percent=percent))
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(str(error) if str(error).startswith(f"{path}") else f"{path}: {error}") from None
 
     def transmission(self, wavelengths: Tensor) -> Tensor:
         """T at the given wavelengths, (L,) float64."""

@@ -296,8 +296,11 @@ def test_tables_as_spreadsheets_write_them(tmp_path: Path) -> None:
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(ValueError, match="is no text"):
         spectral.read_csv(tmp_path / "binary.csv")
-    with pytest.raises(ValueError, match=r"has 2 columns \(a, b\): expected one transmission"):
-        Transmission.from_csv(path)
+    for make in (Transmission.from_csv, lambda path: Transmission(spectral.read_csv(path))):
+        with pytest.raises(ValueError, match=r"has 2 columns \(a, b\): expected one transmission"):
+            make(path)
+    one = write(tmp_path, "nm,T\n400,0.5\n700,0.9\n", "one.csv")
+    assert torch.equal(Transmission(spectral.read_csv(one)).values, Transmission.from_csv(one).values)
 
 
 class TestGlass:
