@@ -196,7 +196,7 @@ def test_every_augmentation_is_raced_on_pictures_and_cubes(augmented):
 def test_the_straightforward_way_gives_the_same_picture(augmented):
     exact = [line for line in augmented["lines"] if line["difference"] is not None]
     # what is drawn from the generator (noise, pattern, the camera) is not compared; two take no cubes
-    assert len(exact) == 2 * 13 - 2
+    assert len(exact) == 2 * 14 - 2
     for line in exact:
         # measured 6e-6: float32 and the PSFs' sampling, each promised to 1e-4 or better; 0 for most
         assert line["difference"] < 5e-5, line["augmentation"]
