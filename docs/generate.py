@@ -1049,7 +1049,8 @@ def augmentation_gallery(path: Path) -> None:
     sys.path.insert(0, str(ROOT / "examples"))
     import augmentation_gallery as example
 
-    save_jpeg(example.figure(example.gallery(), example.original()[0]), path, resolutions=(165, 140, 120))  # noise is bulky
+    figure = example.figure(example.gallery(), example.original()[0])
+    save_jpeg(figure, path, resolutions=(165, 140, 120))  # noise is bulky
 
 
 PLOTS = {"peers.png": RESULTS / "peers.json", "field-growth.png": FIELD} | {

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from kcam.isp.raw import Raw
+
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _TIME = re.compile(r"(?<![a-z0-9.])(\d+(?:\.\d+)?|\.\d+)(s|ms|us|µs)(?![a-z])", re.IGNORECASE)
 _EXPOSURE_TIME, _EXIF = 33434, 34665
@@ -21,7 +23,7 @@ _EXPOSURE_TIME, _EXIF = 33434, 34665
 def read_frame(path: str | os.PathLike[str]) -> np.ndarray:
     """One raw frame as the numbers that the converter gave, (H,W).
 
-    Args:      path: a .tif, .png or .npy of 16 bits.
+    Args:      path: a .tif, .png or .npy of 16 bits, or a camera's raw file (`kcam.Raw`, with the extra ``kcam[raw]``).
     Raises:    FileNotFoundError; ValueError for another suffix, a colour picture, 8 bits, or a damaged file.
 
     Example:
@@ -39,6 +41,8 @@ def read_frame(path: str | os.PathLike[str]) -> np.ndarray:
         raise ValueError(f"{path.name} is no raw frame that can be read: expected one of {', '.join(sorted(READERS))}.")
     try:
         frame = read(path)
+    except ImportError:
+        raise
     except Exception as error:  # of a damaged file a reader may say anything
         raise ValueError(f"{path.name} is damaged, or no {path.suffix} file: {' '.join(str(error).split())}") from error
     check_kind(frame, path.name)
@@ -70,7 +74,12 @@ def _read_png(path: Path) -> np.ndarray:
         return np.asarray(file)
 
 
-READERS: dict[str, Callable[[Path], np.ndarray]] = {
+def _read_raw(path: Path) -> np.ndarray:
+    return Raw.from_file(path).mosaic[0, 0].numpy()
+
+
+RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef")
+READERS: dict[str, Callable[[Path], np.ndarray]] = dict.fromkeys(RAW_SUFFIXES, _read_raw) | {
     ".npy": lambda path: np.load(path, allow_pickle=False),
     ".png": _read_png,
     ".tif": _read_tiff,
@@ -143,6 +152,11 @@ def exposure_time(path: str | os.PathLike[str]) -> float | None:
     if len(found) == 1:
         number, unit = found[0]
         return float(number) * SECONDS[unit.lower()]
+    if path.suffix.lower() in RAW_SUFFIXES and path.is_file():
+        try:
+            return Raw.from_file(path).exposure_time
+        except ValueError:
+            return None  # what cannot be read says so when it is read as a frame
     if path.suffix.lower() in (".tif", ".tiff", ".png") and path.is_file():
         from PIL import Image
 

@@ -17,8 +17,8 @@ from commands import fails, run
 from linear_cameras import Frames, draw
 from PIL import Image
 
-from kcam import Camera, calibration, sensor
-from kcam.calibration import UNITS, photon_transfer
+from kcam import Camera, Raw, calibration, sensor
+from kcam.calibration import UNITS, exposure_time, photon_transfer, read_frame
 from kcam.calibration.photon_transfer import root, rounding_variance, unrounded
 
 
@@ -327,6 +327,19 @@ def test_the_command_writes_numbers_and_a_report(suffix: str, tmp_path: Path, mo
     assert "gain" in page
 
 
+def test_raw_files_of_cameras_are_frames_too(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy")
+    numbers = torch.randint(60, 1000, (1, 1, 24, 32), generator=torch.Generator().manual_seed(0)).float()
+    levels = {"black_level": 64, "white_level": 1023, "neutral": [0.6, 1.0, 0.8], "colour_matrix": torch.eye(3)}
+    Raw(numbers, pattern="RGGB", exposure_time=0.02, **levels).write(tmp_path / "flat.dng")
+    assert (read_frame(tmp_path / "flat.dng") == numbers[0, 0].numpy()).all()
+    assert exposure_time(tmp_path / "flat.dng") == pytest.approx(0.02)
+    (tmp_path / "broken.nef").write_bytes(b"II*")
+    assert exposure_time(tmp_path / "broken.nef") is None
+    with pytest.raises(ValueError, match="broken.nef is damaged"):
+        read_frame(tmp_path / "broken.nef")
+
+
 def test_without_times_a_file_says_null_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     frames = draw(6, size=64, levels=12, bits=12, well=2.0)
@@ -377,7 +390,7 @@ def test_what_the_command_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     Path("f3.tif").write_bytes(b"no more")
     assert "f3.tif is damaged, or no .tif file" in fails("calibrate-sensor", *both)
     os.rename("f3.tif", "f3.jpg")
-    assert "f3.jpg is no raw frame that can be read: expected one of .npy, .png" in fails(
+    assert "f3.jpg is no raw frame that can be read: expected one of .arw, .cr2" in fails(
         "calibrate-sensor", "--darks", "d*.tif", "--flats", "f[12].tif", "--flats", "f3.jpg", "--flats", "f4.tif"
     )
     assert not Path("sensor.json").exists()
