@@ -221,6 +221,7 @@ def test_an_edge_does_not_tell_defocus_from_astigmatism_along_it() -> None:
     assert abs(seen) == pytest.approx(2 * math.sqrt(3) * 60 * nm, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_picture_of_a_camera_is_turned_against_the_light() -> None:
     """The camera's own picture of points, and the lens that it has: coma points to the other side as light falls."""
     seen = lens([0.0] * 6 + [30 * nm, -50 * nm])

@@ -303,7 +303,7 @@ def write(frames: Frames, folder: Path, suffix: str = ".tif", *, timed: bool = T
                     tifffile.imwrite(path, frame)
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".npy", ".png"])
+@pytest.mark.parametrize("suffix", [".tif", *(pytest.param(s, marks=pytest.mark.slow) for s in (".npy", ".png"))])
 def test_the_command_writes_numbers_and_a_report(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     frames = draw(6, pattern="RGGB", size=64, levels=12)
