@@ -46,19 +46,21 @@ def burst(
     first, told = _still_until(camera), camera.resolve(scene)
     if motion is not None:
         _check_motion(motion, camera, first, place)
+    first = min(first, place)
+    own = 1.0 if exposure.compensation is None else exposure.compensation
     still: Any = camera[:first](scene) if first else scene
     still = still.bands() if isinstance(still, Scene) else still
     device = "cpu" if generator is None else generator.device
     seeds = torch.randint(SEEDS, (len(factors),), generator=generator, device=device).tolist()
     pictures, clock = [], 0.0
     for factor, seed in zip(factors, seeds, strict=True):
-        change = {"compensation": factor} if exposure.time is None else {"time": factor}
+        change: dict[str, Any] = {"compensation": factor * own} if exposure.time is None else {"time": factor}
         stages = [*camera][first:]
         stages[place - first] = exposure.changed(**change)
         if motion is not None:
             time: Any = motion.time if exposure.time is None else factor
-            stages.insert(0, motion.changed(time=time, start=clock))
-            clock += float(time) + float(motion.readout) + interval
+            stages.insert(0, motion.changed(time=time, start=motion.start + clock))
+            clock += sum(float(torch.as_tensor(part).detach()) for part in (time, motion.readout, interval))
         shot = Camera(*stages, context=told)
         pictures.append(shot(still, generator=torch.Generator(still.device).manual_seed(seed)))
     return torch.stack(pictures)

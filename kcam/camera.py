@@ -93,11 +93,13 @@ class Camera(nn.Module):
                         f"{name} = {_short(value)}. Give it to one of them only; the other takes it over."
                     )
         fields = {name: value for name, (value, _) in given.items()}
-        glasses, told = self._transmissions(), self.context and self.context.colour_filter
-        if glasses:
-            fields["colour_filter"] = fields["colour_filter"].behind(*glasses)
-        elif _same_curves(told, fields.get("colour_filter")):  # a part of a camera that had glasses before the filter
-            fields["colour_filter"] = told
+        glasses: Any = self._transmissions()
+        told: Any = self.context and self.context.colour_filter
+        own: Any = fields.get("colour_filter")
+        if _same_curves(told, own) and all(any(glass is one for one in told.transmissions) for glass in glasses):
+            fields["colour_filter"] = told  # a part of a camera that had glasses before the filter
+        elif glasses:
+            fields["colour_filter"] = own.behind(*glasses)
         if self.context is not None and isinstance(fields.get("read_noise"), float):  # of a part, others are outside it
             fields["read_noise"] = max(fields["read_noise"], float(self.context.read_noise))
         if isinstance(scene, Scene):
@@ -455,6 +457,8 @@ def _check_order(stages: Sequence[nn.Module]) -> None:
             raise ValueError("Transmission stands before Imaging, which takes a scene. Move it behind Imaging.")
         if isinstance(stage, sensor.ColourFilter) and any(isinstance(one, glass) for one in behind):
             raise ValueError("Transmission stands after ColourFilter, which leaves no bands. Move it before it.")
+        if isinstance(stage, sensor.Motion) and any(isinstance(one, optics.Imaging) for one in behind):
+            raise ValueError("Motion stands before Imaging, which takes a scene. Move it behind Imaging.")
         mosaiced = isinstance(stage, sensor.Mosaic) or (isinstance(stage, sensor.ColourFilter) and stage.is_tile)
         if mosaiced and any(isinstance(one, sensor.Motion) for one in behind):
             name = type(stage).__name__

@@ -51,7 +51,7 @@ class SpectralTable(NamedTuple):
 
     def at(self, wavelengths: Tensor) -> Tensor:
         """The columns at other wavelengths (N,) [m]: (C, N) float64, linear between and 0 outside of the table."""
-        return self.values.double() @ interpolation(self.wavelengths, wavelengths)
+        return self.values.double() @ interpolation(rising(self.wavelengths), wavelengths)
 
 
 def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> SpectralTable:
@@ -524,15 +524,10 @@ def _measured_at_1nm(light: SpectralTable, grid: Grid) -> tuple[np.ndarray, np.n
             f"an illuminant has one column, and this table {len(light.values)} ({', '.join(light.names)}). Take one: "
             "table._replace(values=table.values[:1], names=table.names[:1])."
         )
-    nodes, power = (part.double().numpy() for part in (light.wavelengths / nm, light.values[0]))
+    nodes, power = rising(light.wavelengths).numpy() / nm, light.values[0].detach().double().cpu().numpy()
     if not (np.isfinite(power).all() and (power >= 0).all() and power.any()):
         raise ValueError(f"illuminant must be finite, >= 0 and not all zero, got {power.min():g} to {power.max():g}.")
     eye = _table("observer")["wavelengths"]
-    if nodes[-1] < eye[0] or nodes[0] > eye[-1]:
-        raise ValueError(
-            f"the illuminant has light from {nodes[0]:.0f} to {nodes[-1]:.0f} nm, where the eye sees none, so its "
-            "white has no luminance. Give a relative power per band (L,) with some in 360..830 nm."
-        )
     fine = np.arange(min(eye[0], math.floor(min(grid) - 50)), max(eye[-1], math.ceil(max(grid) + 50)) + 1)
     area = np.concatenate([[0.0], np.cumsum(np.diff(nodes) * (power[1:] + power[:-1]) / 2)])
 
@@ -554,9 +549,14 @@ def _lamp(name: str, grid: Grid) -> np.ndarray:
 def _on_bands(lamp: np.ndarray, fine: np.ndarray, grid: Grid) -> np.ndarray:
     """The power of a lamp, in steps of 1 nm, on bands."""
     matching_1nm = observer(torch.tensor(fine) * nm).numpy()
-    white = lamp @ matching_1nm / (lamp @ matching_1nm[:, 1])
     matching = _colour_matching(grid)
     power = _band_averages(lamp, grid, fine)
+    if not (lamp @ matching_1nm[:, 1] > 0 and power @ matching[:, 1] > 0):
+        raise ValueError(
+            "the illuminant has no light that the eye sees, or none on these bands, so its white has no luminance. "
+            "Give a relative power per band (L,) with some in 360..830 nm."
+        )
+    white = lamp @ matching_1nm / (lamp @ matching_1nm[:, 1])
     power = power / (power @ matching[:, 1])
     relative = power[:, None] * matching  # d XYZ by a relative change of each band; least squares keeps it small
     change = np.linalg.lstsq(relative.T, white - relative.sum(axis=0), rcond=None)[0]

@@ -284,7 +284,7 @@ class Evaluator:
         crops = any(sample.places is not None for sample in self.witnesses)
         for index, stage in enumerate(self.camera):
             trained = any(p.requires_grad for p in stage.parameters())
-            unseen = crops and getattr(stage, "whole_picture", False)
+            unseen = getattr(stage, "each_sample", False) or (crops and getattr(stage, "whole_picture", False))
             if isinstance(stage, Skippable) and not (trained or unseen or isinstance(stage, Imaging)):
                 found.append(index)
             if isinstance(stage, ENDS):

@@ -334,6 +334,14 @@ class ColourFilter(Stage):
         alpha = fit.coefficients[pattern_tile("RGGB")[index[:, None], index]]
         return cls(alpha.float(), width=fit.width, infrared_cut=infrared_cut).trainable()
 
+    @property
+    def bare(self) -> ColourFilter:
+        """The same filter without what stands before it: it shares its coefficients."""
+        made = copy.copy(self)
+        made._modules = {}
+        made.transmissions = ()
+        return made
+
     def trainable(self) -> ColourFilter:
         """A filter of these curves to train, non-negative by softplus whatever it learns.
 

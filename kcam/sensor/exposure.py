@@ -169,7 +169,8 @@ class Exposure(Stage):
                 "Give them, or leave time=None for automatic exposure."
             )
         grid = torch.arange(300, 1101, dtype=torch.float64) * nm
-        response, peak = _green(colour_filter.response(grid)), self.quantum_efficiency
+        bare: Any = getattr(colour_filter, "bare", colour_filter)  # glass before the sensor takes light, no efficiency
+        response, peak = _green(bare.response(grid)), self.quantum_efficiency
         if peak is None:
             peak = DEFAULT_QUANTUM_EFFICIENCY
             if getattr(colour_filter, "photons", False):  # per photon it is what it says

@@ -26,13 +26,14 @@ from kcam.inputs import check_signal
 from kcam.optics.numerics import fast_length
 from kcam.optics.rendering.borders import BORDERS, part
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
-from kcam.units import as_numbers, check_positive
+from kcam.units import as_numbers, check_positive, check_trained
 
 STEP = 0.5
 """Between two moments that are averaged, what moves most moves so far [pixels]: off by 1 % of S'' at most."""
 MOST_SAMPLES = 512
 LONGEST = 4096.0
 """Pixels that anything may move."""
+_NEAR = 16.0  # pixels that content moves, up to which a crop of a picture tells about the whole
 _TAPS, _BEYOND = 8, 16  # of the interpolation of rows, and pixels of border beside what moves in
 
 
@@ -187,7 +188,8 @@ def _reaching(
     n = planes.shape[dim]
     low = int((index if least is None else least).min()) if index.numel() else 0
     high = int(index.max()) + 1 if index.numel() else n
-    low, high = max(low, -2 * n - _BEYOND), min(high, 3 * n + _BEYOND)  # what is farther shows the border's end
+    most = int(LONGEST) + _BEYOND  # nothing moves farther
+    low, high = max(low, -most), min(high, n + most)
     return part(planes, min(low, 0), max(high, n), border, dim=dim), min(low, 0)
 
 
@@ -311,6 +313,9 @@ class Motion(Stage):
             check_positive(time, name="time", unit="s")
         check_not_negative(readout, name="readout", unit="s")
         check_not_negative(start, name="start", unit="s")
+        for name, value in (("time", time), ("readout", readout), ("start", start)):
+            if isinstance(value, Tensor) and value.ndim:
+                raise ValueError(f"{name} must be one number of seconds, got shape {tuple(value.shape)}.")
         if path is not None and _some(start):
             raise ValueError("a path begins where the exposure does: leave out start=, or put it into the path.")
         if border not in BORDERS:
@@ -330,12 +335,18 @@ class Motion(Stage):
         time = self._time(context)
         if not signal.numel():
             return signal
+        if signal.dtype in (torch.float16, torch.bfloat16):  # which have no places to a hundredth of a pixel
+            return self(signal.float(), context).to(signal.dtype)
         if self.flow is not None:
             return self._flowing(signal, self.flow.to(signal), time)
         if self.translation is not None:
             return self._in_layers(signal, context, time)
         path = self._line(self.velocity, time) if self.path is None else self.path
-        return self._together(signal, path, time)
+        if path.ndim == 3 and len(path) not in (1, len(signal)):
+            raise ValueError(
+                f"there are {len(path)} motions for {len(signal)} pictures: expected one for each, or one for all."
+            )
+        return self._together(signal, path, time, border=self.border)
 
     # ---- ways ----
 
@@ -344,22 +355,25 @@ class Motion(Stage):
         ends = (velocity * self.start, velocity * (self.start + time + self.readout))
         return torch.stack(ends, dim=-2)
 
-    def _together(self, signal: Tensor, path: Tensor, time: Any) -> Tensor:
+    def _together(self, signal: Tensor, path: Tensor, time: Any, *, border: str) -> Tensor:
         """All pixels move alike, at once or row by row."""
+        path = path.to(signal.device)
         _check_reach(path)
         if not _some(self.readout):
-            return path_blur(signal, path=path, border=self.border)
-        starts = torch.arange(signal.shape[-2], dtype=torch.float64) / signal.shape[-2] * self.readout
+            return path_blur(signal, path=path, border=border)
+        starts = (
+            torch.arange(signal.shape[-2], dtype=torch.float64, device=signal.device) / signal.shape[-2] * self.readout
+        )
         whole = time + self.readout
         if path.shape[-2] == 2:  # at one velocity every row sees the same blur, from another place on
             own = _at(path, torch.as_tensor(time / whole)[None])[..., 0, :]
-            blurred = path_blur(signal, path=torch.stack([path[..., 0, :], own], dim=-2), border=self.border)
-            return move_rows(blurred, shifts=_at(path, starts / whole) - path[..., :1, :], border=self.border)
+            blurred = path_blur(signal, path=torch.stack([path[..., 0, :], own], dim=-2), border=border)
+            return move_rows(blurred, shifts=_at(path, starts / whole) - path[..., :1, :], border=border)
         count = self._count(path.detach().diff(dim=-2).norm(dim=-1).sum(-1).max() * _value(time / whole))
-        moments = (torch.arange(count, dtype=torch.float64) + 0.5) / count * time
+        moments = (torch.arange(count, dtype=torch.float64, device=signal.device) + 0.5) / count * time
         total: Any = 0.0
         for moment in moments:
-            total = total + move_rows(signal, shifts=_at(path, (starts + moment) / whole), border=self.border)
+            total = total + move_rows(signal, shifts=_at(path, (starts + moment) / whole), border=border)
         return total / count
 
     def _flowing(self, signal: Tensor, flow: Tensor, time: Any) -> Tensor:
@@ -370,7 +384,7 @@ class Motion(Stage):
                 f"(2, {signal.shape[-2]}, {signal.shape[-1]})."
             )
         height = signal.shape[-2]
-        starts = torch.arange(height, dtype=torch.float64) / height * torch.as_tensor(self.readout)
+        starts = torch.arange(height, dtype=torch.float64, device=signal.device) / height * self.readout
         _check_reach(flow.detach() * _value(self.start + time + self.readout))
         count = self._count(flow.detach().norm(dim=1).max() * _value(time))
         total: Any = 0.0
@@ -391,7 +405,7 @@ class Motion(Stage):
         if vergence.ndim == 1:
             vergence = vergence.view(-1, 1, 1, 1)
         vergence = vergence.expand(len(signal), 1, *signal.shape[-2:])
-        low, high = float(vergence.min()), float(vergence.max())
+        low, high = (float(end) for end in vergence.detach().aminmax())
         apart = float(per_vergence.detach().norm()) * (high - low) * _value(self.start + time + self.readout)
         count = min(1 + math.ceil(apart / STEP), MOST_SAMPLES)
         label = ((vergence - low) / max(high - low, 1e-30) * count).long().clamp(max=count - 1)
@@ -406,8 +420,9 @@ class Motion(Stage):
             node = (vergence * here).sum() / here.sum()
             here = F.conv2d(F.pad(here, (2, 2, 2, 2), mode="replicate"), soft)
             path = self._line(per_vergence * node, time)
-            moved = self._together(torch.cat([signal * here, here], dim=1), path, time)
-            own, cover = moved[:, :-1], moved[:, -1:].clamp(0, 1)
+            own = self._together(signal * here, path, time, border=self.border)
+            around = "replicate" if self.border == "zero" else self.border  # darkness covers too
+            cover = self._together(here, path, time, border=around).clamp(0, 1)
             light, covered = own + (1 - cover) * light, cover + (1 - cover) * covered
         return light / covered.clamp(min=1e-3) if count > 1 else light
 
@@ -415,13 +430,24 @@ class Motion(Stage):
 
     @property
     def whole_picture(self) -> bool:
-        """Whether the motion depends on the place in the picture."""
-        return self.flow is not None or _some(self.readout)
+        """Whether the motion depends on the place in the picture, or brings content from far away."""
+        if self.flow is not None or self.translation is not None or _some(self.readout):
+            return True
+        if self.path is not None:
+            return float(self.path.detach().abs().max()) > _NEAR
+        seconds = math.inf if self.time is None else _value(self.start) + _value(self.time)
+        return float(self.velocity.detach().abs().max()) * seconds > _NEAR
 
     @property
     def only_whole(self) -> bool:
-        """Whether it is for pictures of one size."""
-        return self.flow is not None
+        """Whether it is for pictures of one size, or for as many as it has motions."""
+        return self.flow is not None or self.each_sample
+
+    @property
+    def each_sample(self) -> bool:
+        """Whether each picture of a batch has its own motion."""
+        ways = ((self.velocity, 1), (self.path, 2), (self.flow, 3))
+        return any(way is not None and way.ndim > plain and len(way) > 1 for way, plain in ways)
 
     def _count(self, pixels: Any) -> int:
         """Moments that are averaged."""
@@ -430,6 +456,8 @@ class Motion(Stage):
 
     def _time(self, context: Context) -> Any:
         time = context.exposure_time if self.time is None else self.time
+        if time is not None and not 0 < _value(time) < math.inf:
+            raise ValueError(f"the exposure time became {_value(time):g} s in training: expected > 0, such as 0.01.")
         if time is None:
             raise ValueError("Motion knows no exposure time: give time= [s], or the camera an Exposure(time=...).")
         return time
@@ -496,6 +524,7 @@ def _check_finite(value: Tensor, *, name: str) -> None:
 
 
 def _check_reach(places: Tensor) -> None:
+    check_trained(places, name="velocity, path or flow of the Motion")
     most = float(places.detach().abs().max()) if places.numel() else 0.0
     if not most <= LONGEST:
         raise ValueError(

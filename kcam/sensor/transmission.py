@@ -54,7 +54,9 @@ class Transmission(Stage):
             raise ValueError(f"values must be a tensor ({len(nodes)},), one share per wavelength, got {got}.")
         shares = values.detach()
         if not ((shares >= 0) & (shares <= 1)).all():
-            percent = " Percent? Then divide by 100, or read the file with percent=True." if (shares > 1).any() else ""
+            percent = (
+                " Percent? Then divide by 100, or read the file with percent=True." if (shares > 1.5).any() else ""
+            )
             raise ValueError(f"values must be shares, 0..1, got {shares.min():g} to {shares.max():g}.{percent}")
         hold(self, values=values)
         self.wavelengths = nodes  # no buffer: half precision has no number so small

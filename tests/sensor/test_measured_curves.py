@@ -130,6 +130,19 @@ class TestCurves:
         staged = camera[2:](camera[:2](scene))  # 28 bands pass between them
         torch.testing.assert_close(staged, camera(scene), rtol=1e-4, atol=1e-4)
 
+    def test_glass_takes_electrons_and_parts_between_glasses_know_of_both(self) -> None:
+        scene = Scene.builtin("coffee", (12, 16))
+        for colours in (ColourFilter.kodak(), ColourFilter.kodak().behind()):
+            shots = []
+            for share in (1.0, 0.1):
+                grey = Transmission(torch.tensor([400.0, 700.0]) * nm, torch.tensor([share, share]))
+                shots.append(Camera(thin(), grey, colours, sensor.Exposure(time=0.01))(scene))
+            torch.testing.assert_close(shots[1], 0.1 * shots[0])
+        blue, red = (Transmission(torch.tensor([400.0, 700.0]) * nm, torch.tensor(v)) for v in ([1.0, 0.2], [0.1, 1.0]))
+        camera = Camera(thin(), red, blue, ColourFilter.kodak(), sensor.Exposure(), isp.WhiteBalance())
+        for cut in range(1, 6):
+            torch.testing.assert_close(camera[cut:](camera[:cut](scene)), camera(scene), rtol=1e-4, atol=1e-4)
+
     @pytest.mark.parametrize("photons", [False, True])
     def test_saved_cameras_take_the_same_pictures(self, photons: bool, tmp_path: Path) -> None:
         draw = Draw(3)
@@ -361,10 +374,18 @@ class TestLamps:
     def test_errors(self) -> None:
         nodes = torch.tensor([400.0, 700.0]) * nm
         bands = torch.linspace(420, 720, 5).double() * nm
+        narrow = torch.tensor([300.0, 320.0, 340.0]) * nm
+        uv = spectral.SpectralTable(narrow, torch.tensor([[0.0, 1.0, 0.0]]), ("a",))
         for table, text in (
             (spectral.SpectralTable(nodes, torch.ones(2, 2), ("a", "b")), r"one column, and this table 2 \(a, b\)"),
             (spectral.SpectralTable(nodes, torch.zeros(1, 2), ("a",)), "not all zero"),
-            (spectral.SpectralTable(nodes + 500 * nm, torch.ones(1, 2), ("a",)), "where the eye sees none"),
+            (spectral.SpectralTable(nodes + 500 * nm, torch.ones(1, 2), ("a",)), "no light that the eye sees"),
+            (spectral.SpectralTable(nodes - 30 * nm, torch.tensor([[1.0, 0.0]]), ("a",)), None),
+            (spectral.SpectralTable(nodes.flip(0), torch.ones(1, 2), ("a",)), "two or more wavelengths that rise"),
+            (uv, "none on these bands"),
         ):
+            if text is None:
+                assert spectral.illuminant(table, wavelengths=bands).isfinite().all()
+                continue
             with pytest.raises(ValueError, match=text):
                 spectral.illuminant(table, wavelengths=bands)

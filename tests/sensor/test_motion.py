@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.context import Context
-from kcam.planner import noiseless_raw, relative_rms
+from kcam.planner import evaluation, noiseless_raw, relative_rms
 from kcam.sensor import Motion
 from kcam.units import mm, um
 
@@ -278,7 +278,33 @@ class TestInACamera:
         assert 1 <= plan.replaced["2"]["samples"] < 26
         assert "samples" in str(plan)
 
+    def test_far_motion_is_never_judged_by_crops(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What moves in from beyond a crop is not what stands beside it."""
+        monkeypatch.setattr(evaluation, "LARGEST", 64**2)
+        monkeypatch.setattr(evaluation, "CROP", 32)
+        monkeypatch.setattr(evaluation, "WITNESSED", 100**2)
+        light = Scene.from_rgb(torch.linspace(0.2, 1, 600).expand(1, 3, 150, 600), depth=2.0)
+        stages = [sensor.Mosaic("RGGB"), sensor.Exposure(), sensor.ADC(bits=10)]
+        camera = Camera(sensor.ColourFilter.kodak(), Motion((2500.0, 0.0), time=0.1), *stages)
+        with torch.no_grad():
+            plan = camera.plan(light, tolerance=0.2)
+            assert plan.measure(camera, light) <= 0.2
+
+    def test_a_motion_for_each_picture_is_planned(self) -> None:
+        light = Scene.from_rgb(torch.rand(2, 3, 24, 32, generator=torch.Generator().manual_seed(0)), depth=2.0)
+        for motion in (
+            Motion(torch.tensor([[1.0, 0.0], [30.0, 0.0]]), time=0.1),
+            Motion(path=6 * Draw(0).noise(2, 4, 2).float(), time=0.1, readout=0.1),
+            Motion(flow=30 * Draw(1).noise(2, 2, 24, 32).float(), time=0.1),
+        ):
+            camera = self.camera(motion)
+            with torch.no_grad():
+                plan = camera.plan(light, tolerance=0.02)
+                assert plan.measure(camera, light) <= 0.02
+
     def test_order(self) -> None:
+        with pytest.raises(ValueError, match="Motion stands before Imaging"):
+            Camera(Motion((1.0, 0.0), time=1.0), *Camera.phone())
         motion = Motion((1.0, 0.0), time=1.0)
         for before in (sensor.Mosaic("RGGB"), sensor.ColourFilter.learned(4)):
             with pytest.raises(ValueError, match="Motion stands after .*one colour each. Move it before"):
@@ -318,6 +344,17 @@ class TestBurst:
             stages = list(camera)
             alone = Camera(*stages[:2], motion.changed(start=start), *stages[2:])(scene)
             torch.testing.assert_close(picture, alone)
+
+    def test_compensation_start_and_an_early_exposure_stay_the_camera_s(self) -> None:
+        scene = Scene.builtin("coffee", (12, 16))
+        bright = Camera(sensor.ColourFilter.kodak(), sensor.Exposure(compensation=2.0))
+        torch.testing.assert_close(bright.burst(scene, exposures=[1.0])[0], bright(scene))
+        late = Motion((10.0, 0.0), time=0.1, start=1.0)
+        still = [sensor.ColourFilter.kodak(), sensor.Mosaic("RGGB"), sensor.Exposure()]
+        found = Camera(*still).burst(scene, exposures=[1.0], motion=late)[0]
+        torch.testing.assert_close(found, Camera(still[0], late, *still[1:])(scene))
+        early = Camera(sensor.Exposure(), sensor.ColourFilter.kodak(), isp.WhiteBalance(), isp.ToneCurve())
+        torch.testing.assert_close(early.burst(scene, exposures=[1.0])[0], early(scene))
 
     def test_errors(self) -> None:
         camera, scene = Camera.phone(), Scene.builtin("coffee", (8, 12))
@@ -392,8 +429,39 @@ def test_motions_that_are_none(arguments: dict, text: str) -> None:
         Motion(**arguments)
 
 
+def test_far_shifts_of_rows_are_those_of_a_convolution() -> None:
+    picture = torch.rand(1, 1, 3, 16, generator=torch.Generator().manual_seed(0)).double()
+    path = torch.tensor([[160.0, 0.0]] * 3)
+    for border in ("periodic", "reflect", "replicate"):
+        rows, whole = (Motion(path=path, time=1e-6, readout=r, border=border)(picture) for r in (1e-12, 0.0))
+        assert (rows - whole).abs().max() < 1e-6, border
+
+
+def test_darkness_moves_in_over_all_depths() -> None:
+    motion = Motion(translation=(0.01, 0.0), time=0.5, border="zero")
+    depth = torch.ones(1, 1, 8, 32)
+    even = motion(torch.ones(1, 1, 8, 32), TestTranslation.context(depth))
+    depth[..., 16:] = 1.01
+    uneven = motion(torch.ones(1, 1, 8, 32), TestTranslation.context(depth))
+    assert (even - uneven).abs()[..., 20:].max() < 0.1
+    half = motion(torch.ones(1, 1, 8, 32).half(), TestTranslation.context(depth))
+    assert (half - uneven).abs().max() < 2e-3
+
+
 def test_motions_that_do_not_fit_the_picture() -> None:
     picture = torch.ones(1, 3, 8, 8)
+    with pytest.raises(ValueError, match="there are 3 motions for 1 pictures"):
+        Motion(torch.ones(3, 2), time=1.0)(picture)
+    with pytest.raises(ValueError, match=r"time must be one number of seconds, got shape \(2,\)"):
+        Motion((1.0, 0.0), time=torch.tensor([0.1, 0.2]))
+    lost = Motion(nn.Parameter(torch.tensor([1.0, 0.0])), time=nn.Parameter(torch.tensor(0.1)))
+    lost.time.data.fill_(-1.0)
+    with pytest.raises(ValueError, match="exposure time became -1 s in training"):
+        lost(picture)
+    lost.time.data.fill_(0.1)
+    lost.velocity.data.fill_(math.nan)
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        lost(picture)
     with pytest.raises(ValueError, match=r"flow is \(1, 2, 4, 4\) for a picture"):
         Motion(flow=torch.ones(2, 4, 4), time=0.1)(picture)
     with pytest.raises(ValueError, match="goes over 1e\\+05 pixels, more than 4096"):
