@@ -341,6 +341,7 @@ def field_picture(path: Path) -> None:
 
 PLANS = RESULTS / "plans"
 HONESTY, TRAINING = RESULTS / "planner.json", RESULTS / "planner_training.json"
+EFFECTS_HONESTY = RESULTS / "planner_effects.json"
 
 
 def plans_table() -> str:
@@ -379,6 +380,19 @@ def promise_tolerance() -> str:
     return (
         f"Of pairs of camera and scene, {counts}, at five tolerances from {high:g} to {low:g}, **{inside} of {plans}** "
         f"stayed inside; over the random ones a picture is {', '.join(gains)} times as fast in the median."
+    )
+
+
+def plan_effects() -> str:
+    """Whether plans keep their word of cameras with effects of light and sensor, and how near they come."""
+    content = json.loads(EFFECTS_HONESTY.read_text())
+    found = {kind: content[kind] for kind in ("random", "hard", "adversarial")}
+    counts = ", ".join(f"{one['pairs']} {kind}" for kind, one in found.items())
+    outside, worst = sum(one["outside"] for one in found.values()), max(one["worst"] for one in found.values())
+    return (
+        "With one to four of glass, glare, motion, micro-lens shading, crosstalk, defects, banding and a bent response "
+        f"drawn into the camera ({counts} pairs, at the same five tolerances), {outside} plans were outside; the worst "
+        f"came to {worst:.2f} of its tolerance ({results_link(EFFECTS_HONESTY)})."
     )
 
 
@@ -889,6 +903,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "plans": plans_table,
     "honesty": honesty_table,
     "promise_tolerance": promise_tolerance,
+    "plan_effects": plan_effects,
     "promise_effects": promise_effects,
     "training": training_table,
     "field": field_table,
