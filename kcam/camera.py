@@ -179,12 +179,10 @@ class Camera(nn.Module):
         signal: Any = scene
         stages, count = list(self), 0
         while count < len(stages):
-            stage, taken = stages[count], self.absorbed(count)
+            stage = stages[count]
+            taken, colour_filter = self.absorbed(count)
             together = stages[count : count + 1 + taken]
-            if taken:
-                colour_filter: Any = stages[count + taken]
-                glasses = [glass for glass in together if isinstance(glass, sensor.Transmission)]
-                colour_filter = colour_filter.behind(*glasses) if glasses else colour_filter
+            if colour_filter is not None:
                 signal = applied(stage, signal, context, colour_filter=colour_filter)
             else:
                 if isinstance(signal, Scene) and not isinstance(stage, optics.Imaging):
@@ -193,22 +191,23 @@ class Camera(nn.Module):
             count += 1 + taken
             yield count, " + ".join(type(stage).__name__ for stage in together), signal
 
-    def absorbed(self, index: int) -> int:
-        """How many stages behind one it takes into its own computation: of an Imaging the filter that follows it, and
-        the transmissions before that.
+    def absorbed(self, index: int) -> tuple[int, sensor.ColourFilter | None]:
+        """How many stages behind one it takes into its own computation, and as what filter: an Imaging takes that which
+        follows it, behind the transmissions before it.
 
         Example:
-        >>> [Camera.phone().absorbed(index) for index in (0, 1)]
+        >>> [Camera.phone().absorbed(index)[0] for index in (0, 1)]
         [1, 0]
         """
-        if not isinstance(self[index], optics.Imaging):
-            return 0
-        for count, stage in enumerate(list(self)[index + 1 :], start=1):
+        stages = list(self)[index:]
+        glasses: list[Any] = []
+        for stage in stages[1:] if isinstance(stages[0], optics.Imaging) else ():
             if isinstance(stage, sensor.ColourFilter):
-                return count
+                return len(glasses) + 1, stage.behind(*glasses) if glasses else stage
             if not isinstance(stage, sensor.Transmission):
                 break
-        return 0
+            glasses.append(stage)
+        return 0, None
 
     def raw(self, scene: Scene | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
         """What the sensor recorded: the signal just before the demosaic, (B,1,H,W), or (B,C,H,W) of full planes; behind

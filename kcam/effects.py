@@ -63,6 +63,21 @@ class Skippable(Protocol):
         """What decides, with its number: "sigma 3 electrons of 10 000"."""
 
 
+def relative_rms(a: Tensor, b: Tensor) -> float:
+    """sqrt(mean (a - b)^2 / mean b^2): 0 for two black pictures, and without a bound for one.
+
+    Example:
+    >>> from kcam.effects import relative_rms
+    >>> raw = torch.rand(1, 1, 8, 8)
+    >>> round(relative_rms(1.01 * raw, raw), 4)
+    0.01
+    """
+    a, b = a.detach().double(), b.detach().double()
+    if not b.numel():
+        return 0.0
+    return float((a - b).square().mean().sqrt() / b.square().mean().sqrt().clamp(min=1e-30))
+
+
 def relative_change(stage: Stage, signal: Tensor, context: Context | None = None) -> float:
     """What a stage without noise changes of a signal: RMS of the change over the RMS of the signal, by computing it.
 
@@ -73,9 +88,5 @@ def relative_change(stage: Stage, signal: Tensor, context: Context | None = None
     >>> round(relative_change(isp.Clip(), torch.tensor([[[[0.5, 1.1]]]])), 3)  # 0.1 of the root of 0.25 + 1.21
     0.083
     """
-    if not signal.numel():
-        return 0.0
     with torch.no_grad():
-        change = stage(signal, context).double() - signal.double()
-        rms = signal.double().square().mean().sqrt().clamp(min=1e-12)
-        return float(change.square().mean().sqrt() / rms)
+        return relative_rms(stage(signal, context), signal) if signal.numel() else 0.0

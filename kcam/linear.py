@@ -217,19 +217,14 @@ class LinearCamera(nn.Module):
 
     def _behind_the_light(self) -> list[tuple[int, nn.Module]]:
         """Stages behind what `_light` has done."""
-        absorbed = 0 if self.imaging is None else 1 + self._absorbs
-        return list(enumerate(self._stages))[absorbed:]
-
-    @property
-    def _absorbs(self) -> bool:
-        return len(self._stages) > 1 and isinstance(self._stages[1], sensor.ColourFilter)
+        done = 0 if self.imaging is None else 1 + self.camera.absorbed(0)[0]
+        return list(enumerate(self._stages))[done:]
 
     def _light(self, x: Tensor) -> Tensor:
         """Of light x, what falls on the sensor, or what its filter lets through."""
         scene = self._batch(len(x))
         if self.imaging is not None:
-            colour_filter: Any = self._stages[1] if self._absorbs else None
-            return self.imaging.light(x, scene, colour_filter)
+            return self.imaging.light(x, scene, self.camera.absorbed(0)[1])
         if scene.spectra is None:
             return x
         with full_precision(x.device):

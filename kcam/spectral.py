@@ -357,6 +357,23 @@ def xyz_to_linear_srgb(xyz: Tensor) -> Tensor:
     return torch.einsum("rc,...chw->...rhw", xyz_to_srgb_matrix().to(xyz), xyz)
 
 
+def adaptation(white: Tensor, target: Tensor) -> Tensor:
+    """Bradford's matrix from colours under one white to those under another, XYZ to XYZ, (3, 3) float64.
+
+    Args:      white, target: XYZ of the two whites, (3,).
+    Source:    ICC.1:2022, annex E; as in the DNG specification.
+
+    Example:
+    >>> d50, d65 = torch.tensor([0.9642, 1.0, 0.8249]), torch.tensor([0.9505, 1.0, 1.089])
+    >>> torch.allclose(spectral.adaptation(d50, d65) @ d50.double(), d65.double())
+    True
+    """
+    rows = [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+    cones = torch.tensor(rows, dtype=torch.float64)
+    change = (cones @ target.double()) / (cones @ white.double())
+    return torch.linalg.inv(cones) @ (change[:, None] * cones)
+
+
 def rgb_basis(wavelengths: Tensor) -> Tensor:
     """Three reflectance spectra that a linear sRGB colour mixes: reflectance = rgb @ basis.
 
@@ -483,8 +500,8 @@ def _interpolation(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _triangles(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(L, N) for nodes in rising order: 1 at each node, falling to 0 at its neighbours, and 0 outside all of them."""
-    return np.stack([np.interp(points, nodes, unit, left=0, right=0) for unit in np.eye(len(nodes))])
+    """`interpolation` of arrays."""
+    return interpolation(torch.tensor(nodes), torch.tensor(points)).numpy()
 
 
 @functools.lru_cache(maxsize=64)

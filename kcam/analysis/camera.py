@@ -454,19 +454,13 @@ def colour_error(camera: Camera, illuminants: Sequence[str] = LIGHTS) -> list[Co
         got = picture[..., 8:-8, 8:-8].mean((-2, -1)) if picture.shape[-1] > 16 else picture.mean((-2, -1))
         got = srgb.to_light(got.clamp(0, 1)) if _stage(camera, isp.ToneCurve) is not None else got.clamp(0, 1)
         weights = spectral.xyz_weights(grid, name)
-        wanted = patches @ weights @ _bradford(weights.sum(0), daylight).T
+        wanted = patches @ weights @ spectral.adaptation(weights.sum(0), daylight).T
         seen = got @ spectral.xyz_to_srgb_matrix().inverse().T
         white = daylight.numpy()
         labs = [xyz2lab((xyz.numpy() / white) * np.array([0.95047, 1.0, 1.08883])) for xyz in (wanted, seen)]
         delta = torch.as_tensor(deltaE_ciede2000(*labs))
         found.append(ColourError(name, delta, wanted @ spectral.xyz_to_srgb_matrix().T, got))
     return found
-
-
-def _bradford(white: Tensor, target: Tensor) -> Tensor:
-    """From colours under one white to those under another, (3,3)."""
-    cone = torch.tensor([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]).double()
-    return cone.inverse() @ torch.diag((cone @ target) / (cone @ white)) @ cone
 
 
 # ---- over the field --------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from kornia.geometry.transform import remap
 from torch import Tensor
 
 from kcam.augmentation.base import Checked, check_probability, on_drawn_rows
-from kcam.augmentation.distributions import Bounds, Draws, Uniform
+from kcam.augmentation.distributions import Bounds, Draw, Draws, Uniform
 from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.precision import full_precision
 
@@ -117,6 +117,14 @@ class SmoothlyMoved(MovedPixels):
     takes_alpha = True
     _param_generator: Draws
 
+    def __init__(self, draws: dict[str, Draw], *, resample: str, same_on_batch: bool, p: float, keepdim: bool) -> None:
+        check_probability(p)
+        if resample not in ("bilinear", "nearest"):
+            raise ValueError(f'resample must be "bilinear" or "nearest", got {resample!r}.')
+        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
+        self._param_generator = Draws(draws)
+        self.flags = {"resample": Resample.get(resample), "align_corners": True}
+
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
@@ -188,16 +196,12 @@ class RandomLensDistortion(SmoothlyMoved):
         p: float = 0.5,
         keepdim: bool = False,
     ) -> None:
-        check_probability(p)
-        if resample not in ("bilinear", "nearest"):
-            raise ValueError(f'resample must be "bilinear" or "nearest", got {resample!r}.')
-        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
+        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+        draws: dict[str, Draw] = {name: Uniform(bounds, least=-10.0, most=10.0) for name, bounds in values.items()}
+        super().__init__(draws, resample=resample, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
         if not focal_length > 0:
             raise ValueError(f"focal_length must be > 0 of the picture's longer side, got {focal_length:g}.")
-        values = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
-        draws = {name: Uniform(bounds, least=-10.0, most=10.0) for name, bounds in values.items()}
-        self._param_generator = Draws(draws)
-        self.flags = {"resample": Resample.get(resample), "align_corners": True, "focal_length": focal_length}
+        self.flags |= {"focal_length": focal_length}
         self.focal_length = focal_length
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:

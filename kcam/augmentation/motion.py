@@ -6,11 +6,10 @@ import math
 from typing import Literal
 
 import torch
-from kornia.constants import Resample
 from torch import Tensor
 
-from kcam.augmentation.base import CameraAugmentation, check_probability
-from kcam.augmentation.distributions import Bounds, Draw, Draws, Seed, Uniform
+from kcam.augmentation.base import CameraAugmentation
+from kcam.augmentation.distributions import Bounds, Draw, Seed, Uniform
 from kcam.augmentation.geometry import SmoothlyMoved
 from kcam.sensor.motion import path_blur, tremor
 
@@ -106,10 +105,6 @@ class RandomRollingShutter(SmoothlyMoved):
         p: float = 0.5,
         keepdim: bool = False,
     ) -> None:
-        check_probability(p)
-        if resample not in ("bilinear", "nearest"):
-            raise ValueError(f'resample must be "bilinear" or "nearest", got {resample!r}.')
-        super().__init__(p=p, same_on_batch=same_on_batch, p_batch=1.0, keepdim=keepdim)
         draws: dict[str, Draw] = {
             "lean": Uniform(lean, least=-10.0, most=10.0),
             "stretch": Uniform(stretch, least=-0.5, most=0.5),
@@ -117,8 +112,7 @@ class RandomRollingShutter(SmoothlyMoved):
             "cycles": Uniform(cycles, least=0.0, most=100.0),
             "phase": Uniform(phase, least=-1.0, most=1.0),
         }
-        self._param_generator = Draws(draws)
-        self.flags = {"resample": Resample.get(resample), "align_corners": True}
+        super().__init__(draws, resample=resample, same_on_batch=same_on_batch, p=p, keepdim=keepdim)
 
     def _through(self, points: Tensor, params: dict[str, Tensor], shape: tuple[int, int], *, inverse: bool) -> Tensor:
         lean, stretch, wobble, cycles, phase = (

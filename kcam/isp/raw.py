@@ -58,8 +58,6 @@ EIGHT_BITS = 255
 MOST_DN = 65_535
 LIBRAWS = ((2, 2), (6, 6))
 """Tiles that LibRaw knows; of others it takes what it finds for one of these."""
-BRADFORD = ((0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296))
-"""XYZ to the cones of the Bradford adaptation, as the DNG specification has it."""
 D50 = (0.9642, 1.0, 0.8249)
 """The white of the ICC's connection space, to which a ForwardMatrix leads."""
 
@@ -199,9 +197,8 @@ class Raw:
     def forward_matrix(self) -> Tensor:
         """From white balanced channels to XYZ under D50, (3,3) float64: DNG's ForwardMatrix1."""
         to_xyz = torch.linalg.inv(spectral.xyz_to_srgb_matrix())
-        cones = torch.tensor(BRADFORD, dtype=torch.float64)
-        change = (cones @ torch.tensor(D50, dtype=torch.float64)) / (cones @ to_xyz.sum(1))
-        return torch.linalg.inv(cones) @ (change[:, None] * cones) @ to_xyz @ self.camera_to_srgb
+        change = spectral.adaptation(to_xyz.sum(1), torch.tensor(D50, dtype=torch.float64))
+        return change @ to_xyz @ self.camera_to_srgb
 
     @classmethod
     def from_camera(cls, camera: Camera, raw: Tensor, *, scene: Scene | None = None) -> Raw:

@@ -26,11 +26,7 @@ from kcam.optics.numerics import Scalar, float64, legendre
 from kcam.units import as_numbers, check_positive, nm, wavelength_grid
 
 GLARE_BORDERS = ("mirror", "zero")
-_NEAR, _INSIDE, _TURN = (
-    24,
-    5,
-    48,
-)  # pixels from the middle that are integrated, nodes in each, and in half a right angle
+_NEAR, _INSIDE, _TURN = 24, 5, 48  # pixels that are integrated, nodes in each, and in half a right angle
 _KEPT = 2**25  # numbers of transfer functions that a stage keeps
 
 

@@ -281,15 +281,19 @@ class Evaluator:
         One whose effect is of the whole picture (`whole_picture`) is kept where no trial sees that whole.
         """
         found = []
-        crops = any(sample.places is not None for sample in self.witnesses)
         for index, stage in enumerate(self.camera):
             trained = any(p.requires_grad for p in stage.parameters())
-            unseen = getattr(stage, "each_sample", False) or (crops and getattr(stage, "whole_picture", False))
+            unseen = getattr(stage, "each_sample", False) or (getattr(stage, "whole_picture", False) and self._crops)
             if isinstance(stage, Skippable) and not (trained or unseen or isinstance(stage, Imaging)):
                 found.append(index)
             if isinstance(stage, ENDS):
                 break
         return found
+
+    @property
+    def _crops(self) -> bool:
+        """Whether not even the last trial sees pictures whole."""
+        return any(sample.places is not None for sample in self.witnesses)
 
     def _signals(self, settings: Mapping[str, Any]) -> list[dict[int, tuple[Tensor, Context]]]:
         """For each row of the samples: what every stage up to the ADC is given, without noise, with these optics."""

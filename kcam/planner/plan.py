@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from kcam import files
 from kcam.camera import DEVELOPING, Camera
 from kcam.context import Context
+from kcam.effects import relative_rms
 from kcam.optics import Imaging
 from kcam.optics.accuracy import OVER_THE_FIELD
 from kcam.optics.source import Defocus
@@ -493,21 +494,6 @@ def shortened(camera: Camera, changes: Mapping[str, Any], shortcuts: Shortcuts) 
         if kept is not None:
             stages.append(kept)
     return Camera(*stages, context=camera.resolve())
-
-
-def relative_rms(a: Tensor, b: Tensor) -> float:
-    """sqrt(mean (a - b)^2 / mean b^2): 0 for two black pictures, and without a bound for one.
-
-    Example:
-    >>> from kcam.planner import relative_rms
-    >>> raw = torch.rand(1, 1, 8, 8)
-    >>> round(relative_rms(1.01 * raw, raw), 4)
-    0.01
-    """
-    a, b = a.detach().double(), b.detach().double()
-    if not b.numel():
-        return 0.0
-    return float((a - b).square().mean().sqrt() / b.square().mean().sqrt().clamp(min=1e-30))
 
 
 def shares(values: Tensor) -> Tensor:

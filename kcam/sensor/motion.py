@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam.context import Context, Stage
+from kcam.effects import relative_rms
 from kcam.inputs import check_signal
 from kcam.optics.numerics import fast_length
 from kcam.optics.rendering.borders import BORDERS, part
@@ -482,7 +483,7 @@ class Motion(Stage):
             counts.append(counts[-1] * 2)
         found = []
         for count in counts:
-            error = _relative(self.changed(samples=count)(signal, context), whole)
+            error = relative_rms(self.changed(samples=count)(signal, context), whole)
             if error == 0:  # no more are needed
                 break
             found.append((f"{count} sample{'s' * (count > 1)}", {"samples": count}, error))
@@ -490,7 +491,8 @@ class Motion(Stage):
 
     def error_if_skipped(self, signal: Tensor, context: Context) -> float:
         """What the signal changes when nothing moves, relative to its RMS; see `kcam.effects.Skippable`."""
-        return _relative(signal, self(signal, context))
+        with torch.no_grad():
+            return relative_rms(signal, self(signal, context))
 
     def cost(self, signal: Tensor, context: Context) -> float:
         """Passes over the signal: a transform there and back, or 16 for each moment."""
@@ -500,13 +502,6 @@ class Motion(Stage):
     def reason(self, signal: Tensor, context: Context) -> str:
         """What a picture of one moment would cost."""
         return f"1 sample would cost {self.error_if_skipped(signal, context):.2g}"
-
-
-def _relative(one: Tensor, other: Tensor) -> float:
-    if not other.numel():
-        return 0.0
-    apart, whole = (value.detach().double().square().mean().sqrt() for value in (one - other, other))
-    return float(apart / whole.clamp(min=1e-12))
 
 
 def _as_places(given: Any, *, name: str, shapes: str) -> Tensor:

@@ -73,10 +73,11 @@ class Transmission(Stage):
         >>> sensor.Transmission.from_csv("glass.csv", percent=True).values
         tensor([0.0000, 0.9200], dtype=torch.float64)
         """
+        table = spectral.read_csv(path, percent=percent)
         try:
-            return cls(spectral.read_csv(path, percent=percent))
+            return cls(table)
         except ValueError as error:
-            raise ValueError(str(error) if str(error).startswith(f"{path}") else f"{path}: {error}") from None
+            raise ValueError(f"{path}: {error}") from None
 
     def transmission(self, wavelengths: Tensor) -> Tensor:
         """T at the given wavelengths, (L,) float64."""
