@@ -84,6 +84,17 @@ class Context:
     white_share: float = 0.8
     black_level: float = 0.0
 
+    @property
+    def exposed_white(self) -> Tensor | float:
+        """A perfect white in green behind the ADC, of full scale: `white_share` of it, or of a well that is full first.
+
+        Example:
+        >>> [kcam.Context(gain=gain).exposed_white for gain in (0.5, 1.0, 8.0)]
+        [0.4, 0.8, 0.8]
+        """
+        gain: Any = self.gain
+        return self.white_share * (gain.clamp(max=1) if isinstance(gain, Tensor) else min(gain, 1.0))
+
 
 def arguments_text(module: nn.Module, *, but: Container[str] = ()) -> str:
     """The constructor arguments that a module holds, as ``print`` shows them: a tensor of many values by its shape.

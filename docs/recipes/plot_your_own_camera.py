@@ -194,7 +194,7 @@ passing = sensor.Motion(velocity=(-2000.0, 0.0), time=0.002, readout=0.03)
 moving = {"a trembling hand, 0.1 s": hand, "passing by, rows in 30 ms": passing}
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.3), layout="constrained")
 for ax, (title, motion) in zip(axes, moving.items(), strict=False):
-    shaken = Camera(*camera[:3], motion, *camera[3:])
+    shaken = Camera(*camera[:3], motion, camera[3], sensor.Exposure(), *camera[5:])  # as bright, whatever the time
     ax.imshow(plots.as_image(shaken(scene, generator=torch.Generator().manual_seed(0))[0]))
     ax.set_title(title)
 bracket = camera.burst(scene, exposures=[0.001, 0.005, 0.025], generator=torch.Generator().manual_seed(0))

@@ -176,14 +176,14 @@ def _plane(signal: Tensor, camera: Camera) -> Tensor:
 @torch.no_grad()
 def _response(camera: Camera) -> tuple[float, float]:
     """Of the raw in green, noiseless: the value without light, and its rise for the scene's white, not saturated."""
-    part = _raw_part(camera).noiseless()
+    part, most = _raw_part(camera).noiseless(), _saturation(camera)
     dark = float(_plane(part(_evenly(camera, 0.0, size=56)), camera).double().mean())
     level = 1e-2
     rise = 0.0
     for _ in range(12):  # to where steps of an ADC do not matter and nothing saturates
         rise = float(_plane(part(_evenly(camera, level, size=56)), camera).double().mean()) - dark
-        if not 0.2 < rise / max(1 - dark, 1e-6) < 0.6:
-            level *= min(max(0.4 * (1 - dark) / max(rise, 1e-4), 0.02), 50.0)
+        if not 0.2 < rise / max(most - dark, 1e-6) < 0.6:
+            level *= min(max(0.4 * (most - dark) / max(rise, 1e-4), 0.02), 50.0)
         else:
             break
     if not rise > 0:
@@ -192,11 +192,13 @@ def _response(camera: Camera) -> tuple[float, float]:
 
 
 def _electrons(camera: Camera) -> float:
-    """Of one unit of the raw, in which 1.0 is full scale: full well over gain, less what black takes."""
+    """Of one unit of the raw, in which 1.0 is full scale: full well over gain."""
     context = camera.resolve()
-    adc = _stage(camera, sensor.ADC)
-    black = float(context.black_level) if adc is not None else 0.0
-    return float(context.full_well) / (float(context.gain) if adc is not None else 1.0) / (1 - black)
+    return float(context.full_well) / (1.0 if _stage(camera, sensor.ADC) is None else float(context.gain))
+
+
+def _saturation(camera: Camera) -> float:
+    return sensor.saturation(camera, camera.resolve())
 
 
 # ---- resolution ------------------------------------------------------------------------------------------------------
@@ -243,7 +245,7 @@ def edge_response(
         grid = _few(grid)
     light = spectral.illuminant("D65", wavelengths=grid)
     dark, rise = _response(camera) if whole else (0.0, 1.0)
-    bright = 0.8 if not whole else min(0.8, 0.75 * (1 - dark) / rise)
+    bright = 0.8 if not whole else min(0.8, 0.75 * (_saturation(camera) - dark) / rise)
     at = (torch.arange(side * FINE, dtype=torch.float64) + 0.5) / FINE - side / 2
     tangent = math.tan(math.radians(angle))
     across = (at[None] - tangent * at[:, None]) * math.cos(math.radians(angle))
@@ -333,10 +335,11 @@ def signal_to_noise(
     if shares.ndim != 1 or not len(shares) or not bool((shares > 0).all() and shares.isfinite().all()):
         raise ValueError(f"exposures must be shares of saturation above 0, such as [0.01, 0.1], got {exposures}.")
     part, (dark, rise), unit = _raw_part(camera), _response(camera), _electrons(camera)
+    full = (_saturation(camera) - dark) / rise
     generator = torch.Generator().manual_seed(seed)
     means, sigmas = [], []
     for share in shares.tolist():
-        mean, sigma = _temporal(camera, part, share * (1 - dark) / rise, generator)
+        mean, sigma = _temporal(camera, part, share * full, generator)
         means.append((mean - dark) * unit)
         sigmas.append(sigma * unit)
     electrons, noise = torch.tensor(means, dtype=torch.float64), torch.tensor(sigmas, dtype=torch.float64)
@@ -352,16 +355,18 @@ def _temporal(camera: Camera, part: Camera, level: float, generator: torch.Gener
 
 @torch.no_grad()
 def dynamic_range(camera: Camera, *, seed: int = 0) -> DynamicRange:
-    """Full scale above black over the temporal noise in the dark, quantisation included.
+    """Saturation above black over the temporal noise in the dark, quantisation included.
 
-    DR = full scale / sqrt(sigma_dark^2 + step^2 / 12),   sigma_dark: before the ADC
+    DR = saturation / sqrt(sigma_dark^2 + step^2 / 12),   sigma_dark: before the ADC
+
+    Saturated is a full well or the end of the converter, whichever comes first.
 
     Raises:    NotMeasured for a camera without noise and without steps: nothing limits it.
     Source:    EMVA Standard 1288, release 4.0, 6.8.
 
     Example:
-    >>> found = kcam.analysis.dynamic_range(Camera.slr())  # 60 000 electrons over 4 of read noise and steps of 15.1
-    >>> abs(found.dark_noise / math.hypot(4.0, 15.1 / 12**0.5) - 1) < 0.06
+    >>> found = kcam.analysis.dynamic_range(Camera.slr())  # 60 000 electrons over 4 of read noise and steps of 14.65
+    >>> abs(found.dark_noise / math.hypot(4.0, 14.65 / 12**0.5) - 1) < 0.06
     True
     """
     part, (dark, _), unit = _raw_part(camera), _response(camera), _electrons(camera)
@@ -375,7 +380,7 @@ def dynamic_range(camera: Camera, *, seed: int = 0) -> DynamicRange:
         noise = math.hypot(sigma * float(camera.resolve().full_well), step / math.sqrt(12))
     if noise == 0:
         raise NotMeasured("no noise and no ADC: nothing limits the dynamic range.")
-    return DynamicRange((1 - dark) * unit, noise)
+    return DynamicRange((_saturation(camera) - dark) * unit, noise)
 
 
 @torch.no_grad()

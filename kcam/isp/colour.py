@@ -172,9 +172,9 @@ def as_shot_colour_matrix(context: Context, *, channels: int = 3) -> Tensor:
     The patches are taken by the filter under the scene's light, white balanced, and fitted to their colours under D65
     (the colour of a surface is what it is in daylight, so no model of chromatic adaptation is needed).
 
-    Args:      context: as for `as_shot_gains`, and white_share.  channels: C of the signal.
-    Returns:   (3,C) float64: an exposed (white_share), balanced signal to linear sRGB, a perfect white to (1,1,1);
-               differentiable in the filter.
+    Args:      context: as for `as_shot_gains`, and white_share and gain.  channels: C of the signal.
+    Returns:   (3,C) float64: an exposed (`Context.exposed_white`), balanced signal to linear sRGB, a perfect white to
+               (1,1,1); differentiable in the filter.
     Raises:    ValueError if the filter has not one curve per channel.
 
     Example:
@@ -192,7 +192,7 @@ def as_shot_colour_matrix(context: Context, *, channels: int = 3) -> Tensor:
     white = (weights @ light).clamp(min=LEAST_WHITE)
     signals = (patches @ weights.T) / white
     colours = torch.tensor(_chart_in_linear_srgb(), dtype=weights.dtype, device=weights.device)
-    return fit_colour_matrix(signals, colours=colours) / like(context.white_share, signals)
+    return fit_colour_matrix(signals, colours=colours) / like(context.exposed_white, signals)
 
 
 @in_float32

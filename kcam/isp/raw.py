@@ -39,7 +39,7 @@ from kcam.isp.colour import (
     white_balance,
 )
 from kcam.isp.demosaic import Demosaic, demosaic
-from kcam.sensor.adc import ADC
+from kcam.sensor.adc import ADC, saturation
 from kcam.sensor.exposure import Exposure
 from kcam.sensor.mosaic import PATTERNS
 from kcam.sensor.noise import FixedPattern, RandomStage, in_float32
@@ -83,7 +83,7 @@ class Raw:
     Fields:    mosaic: (1,1,H,W) [DN], float32 or float64, which hold 16 bits exactly; whole numbers become float32.
                pattern: name in `kcam.sensor.PATTERNS`, its tile's corner on the picture's; None for monochrome.
                black_level: the number of no light [DN]: one, or a tensor of one for each cell of the pattern's tile.
-               white_level: the number of a full pixel, above 255 [DN].
+               white_level: the number of a full pixel, of its well or of the converter, above 255 [DN].
                neutral: (3,) what a white gives in each channel in the light of the shot, 1 in green (DNG's
                AsShotNeutral, 1 / gains; brought there by its green); None where nothing is known, or monochrome.
                colour_matrix: (3,3) XYZ in daylight to the camera's channels (DNG's ColorMatrix1 for D65), or None.
@@ -238,15 +238,16 @@ class Raw:
         pattern = _pattern_of(camera, context)
         top = 2**adc.bits - 1
         black = _number(adc.black_level, "black_level of the ADC", "DN")
+        white = round(top * saturation(camera, context))
         numbers = top * (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw)
         exposure = next((stage.time for stage in camera if isinstance(stage, Exposure)), None)
         return cls(
             mosaic=round_ste(numbers) if adc.rounding else numbers,
             pattern=pattern,
             black_level=black,
-            white_level=top,
-            **_colours(camera, context, mono=pattern is None, share=(top - black) / top),
-            noise_profile=_noise_profile(camera, context, adc, black=black, size=raw.shape[-2:]),
+            white_level=white,
+            **_colours(camera, context, mono=pattern is None, share=(white - black) / top),
+            noise_profile=_noise_profile(camera, context, adc, range_=white - black, size=raw.shape[-2:]),
             exposure_time=None if exposure is None else float(exposure),
             iso=100 * float(torch.as_tensor(_gain(adc, context)).detach()),
         )
@@ -607,10 +608,12 @@ def _gain(adc: ADC, context: Context) -> Tensor | float:
 
 
 def _noise_profile(
-    camera: Camera, context: Context, adc: ADC, *, black: float, size: Sequence[int]
+    camera: Camera, context: Context, adc: ADC, *, range_: float, size: Sequence[int]
 ) -> tuple[float, float] | None:
-    """(S, O) of the variance S x + O of a signal with black at 0 and white at 1; None if a stage does not say it."""
-    top = 2**adc.bits - 1
+    """(S, O) of the variance S x + O of a signal with black at 0 and white at 1; None if a stage does not say it.
+
+    Args:      range_: from black to white level [DN].
+    """
     half = torch.full((1, 1, *size), 0.5, dtype=torch.float64)
     in_half = in_dark = 0.0
     for stage in camera:
@@ -623,8 +626,8 @@ def _noise_profile(
                 return None
             in_half += float(light.double().square().mean())
             in_dark += float(dark.double().square().mean())
-    scale = float(torch.as_tensor(_gain(adc, context)).detach()) * top / (top - black)
-    step = 1 / (top - black) if adc.rounding else 0.0
+    scale = float(torch.as_tensor(_gain(adc, context)).detach()) * (2**adc.bits - 1) / range_
+    step = 1 / range_ if adc.rounding else 0.0
     return scale * (in_half - in_dark) / 0.5, scale**2 * in_dark + step**2 / 12
 
 

@@ -6,14 +6,14 @@ import dataclasses
 import math
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 
 from kcam.camera import Camera
-from kcam.context import Context
-from kcam.effects import Work
+from kcam.context import Context, Stage
+from kcam.effects import Skippable, Work
 from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
@@ -185,9 +185,9 @@ class Planner:
             trained=tuple(name for name, p in self.camera.named_parameters() if p.requires_grad)
             if self.evaluator.gradients
             else (),
-            seconds=rows.spent[0],
+            seconds=rows.spent[0] + rows.beside,
             memory=rows.spent[1],
-            reference_seconds=reference[0],
+            reference_seconds=reference[0] + sum(self.prices.stages.values()),
             reference_memory=reference[1],
             planning_seconds=self._setup + time.perf_counter() - start,
         )
@@ -342,7 +342,6 @@ class _Skip:
         self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst])
         forms = getattr(self.stage, "cheaper", None)
         self.forms = [("left out", None, self.error_if_skipped), *(forms(*found[worst]) if callable(forms) else ())]
-        self.touched = self.stage.cost(*found[worst]) * max(signal.numel() for signal, _ in found)
 
     @property
     def error(self) -> float:
@@ -381,7 +380,10 @@ def _shortcuts(skips: Sequence[_Skip], allowed: float, noise: float | None) -> d
 
 
 class _Prices:
-    """Predicted time and memory of the raw of the scene that takes longest."""
+    """Predicted time and memory of the raw of the scene that takes longest.
+
+    stages: seconds of each stage that says its cost, beside the optics, by its index.
+    """
 
     def __init__(
         self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any], *, one: bool
@@ -395,6 +397,25 @@ class _Prices:
         self.scene = scenes[0]
         if len(scenes) > 1:
             self.scene = max(scenes, key=lambda scene: self._seconds(scene))
+        self.context = camera.resolve(self.scene)
+        self.given = dict(self._given(camera))
+        self.stages = {index: self.of_stage(index, camera[index]) for index in self.given}
+
+    def _given(self, camera: Camera) -> Iterator[tuple[int, torch.Tensor]]:
+        """Index of each stage that says its cost, up to the ADC, and a signal as large as the one that it is given."""
+        batch, height, width = self.scene.shape
+        channels = self.channels or 1
+        for index, stage in enumerate(camera):
+            if isinstance(stage, Skippable) and not isinstance(stage, Imaging):
+                yield index, torch.zeros(()).expand(batch, channels, height, width)
+            channels = stage.output_channels(channels, self.context) if isinstance(stage, Stage) else channels
+            if isinstance(stage, ENDS):
+                return
+
+    def of_stage(self, index: int, stage: Any) -> float:
+        """Seconds of a stage in this place."""
+        signal = self.given[index]
+        return self.rates["touch"] * signal.numel() * stage.cost(signal, self.context)
 
     @staticmethod
     def _channels(camera: Camera, scene: Scene) -> int | None:
@@ -442,10 +463,12 @@ class _Rows:
         self.price = price
         self.decisions: list[Decision] = []
         self.changes: dict[str, Any] = dict(price.always)
-        self.spent = price.of(self.changes)
+        self.spent, self.beside = price.of(self.changes), sum(price.stages.values())
 
     def _add(self, effect: str, chosen: str, instead: str, why: str, error: float = 0.0, counted: bool = True) -> None:
-        self.decisions.append(Decision(effect, chosen, instead, why, error, counted, *self.spent))
+        self.decisions.append(
+            Decision(effect, chosen, instead, why, error, counted, self.spent[0] + self.beside, self.spent[1])
+        )
 
     def add_ladder(self, ladder: Ladder) -> None:
         """A choice of optics."""
@@ -473,9 +496,12 @@ class _Rows:
         name = type(skip.stage).__name__
         error = skip.error_if_skipped if left_out or not skip.counted else skip.error
         replaced = skip.counted and not skip.at_top
-        form = skip.forms[skip.position][0] if replaced else "kept"
+        form, arguments, _ = skip.forms[skip.position] if replaced else ("kept", None, 0.0)
         chosen, instead = ("left out", "kept") if left_out else (form, "kept" if replaced else "")
-        saved = self.price.rates["touch"] * skip.touched
+        saved = self.price.stages[skip.index] if left_out else 0.0
+        if arguments is not None:
+            saved = self.price.stages[skip.index] - self.price.of_stage(skip.index, skip.stage.changed(**arguments))
+        self.beside -= saved
         why = f"{skip.reason}; saves {saved * 1e3:.2g} ms" if left_out else skip.reason
         self._add(name, chosen, instead, why, error, skip.counted)
 

@@ -1,6 +1,6 @@
 """The sensor: from irradiance to the numbers of a raw picture."""
 
-from kcam.sensor.adc import ADC, quantise
+from kcam.sensor.adc import ADC, quantise, saturation
 from kcam.sensor.banding import RowColumnNoise, fixed_stripes, row_column_noise
 from kcam.sensor.calibrated import from_calibration
 from kcam.sensor.colour_filter import ColourFilter, fit_gaussians
@@ -63,6 +63,7 @@ __all__ = [
     "quantise",
     "read_noise",
     "row_column_noise",
+    "saturation",
     "shot_noise",
     "tremor",
     "warp",

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcam.cache import is_plain
 from kcam.context import Context, Stage
-from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.sensor.noise import DarkCurrent, ShotNoise, check_not_negative, hold, in_float32, like
 from kcam.ste import clip_ste, round_ste
 from kcam.units import check_positive
 
@@ -56,6 +57,26 @@ def quantise(
 
 def _is(value: Tensor | float, neutral: float) -> bool:
     return not isinstance(value, Tensor) and value == neutral
+
+
+def saturation(stages: Iterable[nn.Module], context: Context) -> float:
+    """The highest raw value of a sensor, as a share of full scale: of its converter, or of a well that is full first.
+
+    min(1, gain + black_level);   1 without a stage that ends at the full well (ShotNoise, DarkCurrent)
+
+    Args:      stages: of a camera.  context: as `Camera.resolve` gives it.
+
+    Example:
+    >>> stages = [sensor.ShotNoise(5_000), sensor.ADC(bits=12, black_level=64, gain=0.5)]
+    >>> round(4095 * sensor.saturation(stages, Camera(*stages).resolve()), 1)  # DN
+    2111.5
+    """
+    stages = list(stages)
+    converter = next((stage for stage in stages if isinstance(stage, ADC)), None)
+    if converter is None or not any(isinstance(stage, (ShotNoise, DarkCurrent)) for stage in stages):
+        return 1.0
+    gain, black = converter._gain(context), converter.black_level / (2**converter.bits - 1)
+    return min(1.0, float(torch.as_tensor(gain + black).detach().max()))
 
 
 class ADC(Stage):

@@ -29,15 +29,16 @@ DEFAULT_QUANTUM_EFFICIENCY = 0.5
 
 
 def white_gain(*, white: Tensor, white_share: Tensor | float, gain: Tensor | float = 1.0) -> Tensor:
-    """What brings a perfect white to a share of full scale in green, at the analogue gain that follows.
+    """What brings a perfect white to a share of what is full first in green, the converter behind the gain or the well.
 
-    factor = white_share / (gain white_green)
+    factor = white_share / (max(gain, 1) white_green)
 
     Args:      white: (C,) signal of a perfect white per channel; green is channel 1, or the only one.
-               white_share: of full scale after the gain.  gain: analogue gain (ISO / 100).
+               white_share: of full scale after the gain, or of the full well.  gain: analogue gain (ISO / 100).
     Returns:   0-d factor on the signal. A filter that sees nothing of the light (white < 1e-6) keeps a finite one.
     """
-    return white_share / (gain * _green(white).clamp(min=1e-6))
+    most = gain.clamp(min=1) if isinstance(gain, Tensor) else max(gain, 1.0)
+    return white_share / (most * _green(white).clamp(min=1e-6))
 
 
 def electrons_per_unit(
@@ -90,11 +91,12 @@ class Exposure(Stage):
     """The exposure: scales the signal so that 1.0 is the full well. It works before and after the mosaic.
 
     Without `time` it is automatic: a perfect white under the scene's light fills `white_share` of full scale in green
-    (a learned tile: on average over the tile), divided by the ISO gain that the ADC restores. With `time` it is
-    physical, `electrons_per_unit` / full_well, from the scene's luminance, the lens's aperture, the pixel and the time:
-    stopping down costs photons, and ISO changes the gain but not the electrons. `white_share` then only tells the
-    stages behind the ADC what counts as white. So `iso` without `time` keeps the picture's brightness and sets its
-    noise, like a camera that shortens its time: at ISO 800 white is an eighth of the electrons.
+    (a learned tile: on average over the tile), divided by the ISO gain that the ADC restores; with a gain below 1 the
+    well is full before the converter, and white fills that share of the well. With `time` it is physical,
+    `electrons_per_unit` / full_well, from the scene's luminance, the lens's aperture, the pixel and the time: stopping
+    down costs photons, and ISO changes the gain but not the electrons. `white_share` then only tells the stages behind
+    the ADC what counts as white. So `iso` without `time` keeps the picture's brightness and sets its noise, like a
+    camera that shortens its time: at ISO 800 white is an eighth of the electrons.
 
     The signal is the *mean* relative irradiance over the light-sensitive area of a pixel (a uniform white is 1,
     whatever the fill factor); this stage alone multiplies by that area, pitch^2 fill_factor.

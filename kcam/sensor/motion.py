@@ -249,7 +249,7 @@ class Motion(Stage):
         translation: of the camera, x and y [m/s]; the nearer, the faster: content moves by -translation d / (depth
             pitch). In layers of depth, of which near ones hide those behind, each half a pixel of motion from the next.
 
-    Args:      time: exposure time [s]; None for that of ``Exposure(time=...)``.
+    Args:      time: exposure time [s]; None for that of ``Exposure(time=...)``. In a camera the two must agree.
                readout: from the start of the first row to that of one after the last [s]: 0 for a global shutter.
                start: how long all has moved when the first row's exposure begins [s], such as of a later picture.
                border: what moves in from beyond the picture: reflect, replicate, periodic or zero.
@@ -370,7 +370,7 @@ class Motion(Stage):
             own = _at(path, torch.as_tensor(time / whole)[None])[..., 0, :]
             blurred = path_blur(signal, path=torch.stack([path[..., 0, :], own], dim=-2), border=border)
             return move_rows(blurred, shifts=_at(path, starts / whole) - path[..., :1, :], border=border)
-        count = self._count(path.detach().diff(dim=-2).norm(dim=-1).sum(-1).max() * _value(time / whole))
+        count = self._moments(time)
         moments = (torch.arange(count, dtype=torch.float64, device=signal.device) + 0.5) / count * time
         total: Any = 0.0
         for moment in moments:
@@ -387,7 +387,7 @@ class Motion(Stage):
         height = signal.shape[-2]
         starts = torch.arange(height, dtype=torch.float64, device=signal.device) / height * self.readout
         _check_reach(flow.detach() * _value(self.start + time + self.readout))
-        count = self._count(flow.detach().norm(dim=1).max() * _value(time))
+        count = self._moments(time)
         total: Any = 0.0
         for index in range(count):
             moments = self.start + starts + (index + 0.5) / count * time
@@ -450,10 +450,19 @@ class Motion(Stage):
         ways = ((self.velocity, 1), (self.path, 2), (self.flow, 3))
         return any(way is not None and way.ndim > plain and len(way) > 1 for way, plain in ways)
 
-    def _count(self, pixels: Any) -> int:
-        """Moments that are averaged."""
+    def _moments(self, time: Any) -> int:
+        """How many are averaged, of a flow or along a path: the longest way in an exposure goes by `STEP`."""
+        if self.flow is not None:
+            pixels = self.flow.detach().norm(dim=-3).max() * _value(time)
+        else:
+            way = self.path.detach().diff(dim=-2).norm(dim=-1).sum(-1).max()
+            pixels = way * _value(time / (time + self.readout))
         asked = min(max(1, math.ceil(float(pixels) / STEP)), MOST_SAMPLES)
         return asked if self.samples is None else min(self.samples, asked)
+
+    def provides(self) -> dict[str, Any]:
+        """The exposure time, where it was given: one that an Exposure contradicts is an error."""
+        return {} if self.time is None else {"exposure_time": self.time}
 
     def _time(self, context: Context) -> Any:
         time = context.exposure_time if self.time is None else self.time
@@ -495,9 +504,10 @@ class Motion(Stage):
             return relative_rms(signal, self(signal, context))
 
     def cost(self, signal: Tensor, context: Context) -> float:
-        """Passes over the signal: a transform there and back, or 16 for each moment."""
-        moments = self.samples or 8
-        return 16.0 * moments if self._sampled else 40.0
+        """Passes over the signal: transforms, of all rows at once, or sums over neighbours at each moment; measured."""
+        if self._sampled:
+            return (300.0 if self.flow is not None else 130.0) * self._moments(self._time(context))
+        return 300.0 if self.translation is None else 1000.0
 
     def reason(self, signal: Tensor, context: Context) -> str:
         """What a picture of one moment would cost."""

@@ -469,3 +469,35 @@ def test_motions_that_do_not_fit_the_picture() -> None:
     assert Motion((1.0, 0.0), time=0.1)(torch.ones(0, 3, 4, 4)).shape == (0, 3, 4, 4)
     assert (Motion((300.0, 0.0), time=0.1)(torch.ones(1, 3, 1, 1)) - 1).abs().max() < 1e-5
     assert Motion((3.0, 0.0), time=0.1)(picture.half()).dtype == torch.float16
+
+
+def moving(*, time: float | None = None, exposure: float | None = None) -> Camera:
+    lens = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(12 * mm), focus_distance=2.0)
+    shaken = Motion(path=sensor.tremor(0.1, amplitude=4.0, seed=3), time=time, readout=0.02)
+    return Camera(
+        optics.Imaging(lens, pixel_pitch=4 * um), sensor.ColourFilter.kodak(), shaken, sensor.Mosaic("RGGB"),
+        sensor.Exposure(time=exposure), sensor.ShotNoise(10_000), sensor.ADC(12),
+    )  # fmt: skip
+
+
+def test_the_time_of_a_plan_holds_that_of_the_stages() -> None:
+    camera, scene = moving(time=0.1), Scene.builtin("coffee", size=48)
+    still = Camera(*(stage for stage in camera if not isinstance(stage, Motion)))
+    with torch.no_grad():
+        plan, without = camera.plan(scene, tolerance=0.02), still.plan(scene, tolerance=0.02)
+    row = next(row for row in plan.decisions if row.effect == "Motion")
+    assert "sample" in row.chosen
+    samples = int(row.chosen.split()[0])
+    costs = [stage.cost(torch.zeros(1), camera.resolve()) for stage in (camera[2], camera[2].changed(samples=samples))]
+    assert costs[1] < costs[0]
+    apart = (plan.reference_seconds - without.reference_seconds, plan.seconds - without.seconds)
+    assert apart[0] / apart[1] == pytest.approx(costs[0] / costs[1], rel=0.1)  # noise may be left out of one alone
+
+
+def test_an_exposure_of_another_time_is_a_contradiction() -> None:
+    scene = Scene.builtin("coffee", size=16)
+    with pytest.raises(ValueError, match=r"Motion \(stage 2\) has exposure_time = 0.1, Exposure \(stage 4\) .* 0.005"):
+        moving(time=0.1, exposure=0.005)(scene)
+    one, other = moving(time=0.1, exposure=0.1), moving(exposure=0.1)
+    pictures = [camera.noiseless()(scene) for camera in (one, other)]
+    assert torch.equal(*pictures)
