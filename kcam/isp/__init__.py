@@ -26,6 +26,7 @@ from kcam.isp.denoise import Denoise, denoise
 from kcam.isp.finish import JPEG, LocalToneMapping, Sharpen, jpeg, map_tones_locally, sharpen
 from kcam.isp.raw import develop
 from kcam.isp.style_stage import StyleStage
+from kcam.isp.texture_transfer import TextureTransfer, texture_transfer
 
 __all__ = [
     "DEMOSAICS",
@@ -40,6 +41,7 @@ __all__ = [
     "LocalToneMapping",
     "Sharpen",
     "StyleStage",
+    "TextureTransfer",
     "ToneCurve",
     "WhiteBalance",
     "apply_colour_matrix",
@@ -55,6 +57,7 @@ __all__ = [
     "map_tones_locally",
     "render_tones",
     "sharpen",
+    "texture_transfer",
     "tone_curve",
     "white_balance",
 ]

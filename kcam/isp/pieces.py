@@ -1,0 +1,241 @@
+"""Pieces of an exemplar, such as a painting, laid so that they fit what is asked for and each other.
+
+    minimise over places s(p):  sum_p |f(s(p)) - g(p)|^2_w(p) + k sum_(p, q neighbours) |e(s(p)) - e(s(q) + p - q)|^2
+                                                                                      + |e(s(p) + q - p) - e(s(q))|^2
+
+e is what the exemplar shows, f what is compared of it, g what is asked for. Neighbours whose places are neighbours too
+cost nothing: the exemplar goes on as it is, and pieces grow; where two meet, the sum asks that each would show what the
+other does. The least is looked for from an eighth of the size on, pixel by pixel, among places that neighbours, chance
+and small steps suggest. What only a few pixels would gain by changing together is found at the coarser levels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
+FIRST = 2048  # places, of which each pixel of the coarsest level takes the one that fits best
+COMPARED = 2**22  # numbers at once
+JUMPS = (1, 2, 4, 1)  # pixels: how far away a neighbour's piece is offered
+SMALL = 8000  # pixels of a level that chance can help
+CHANCES, FEW = 24, 4  # places by chance in a round, of a small level and of others
+AT_ONCE = 2**15  # pixels
+
+
+@dataclass(frozen=True)
+class Book:
+    """The places of an exemplar in all its turns, at one size: a place is an index into the tables.
+
+    shown: (E,3), what is seen there. compared: (E,F), what it is chosen by. allowed: (E,) whether there is a pixel all
+    around it. turns, height, width: E is their product.
+    """
+
+    shown: Tensor
+    compared: Tensor
+    allowed: Tensor
+    turns: int
+    height: int
+    width: int
+
+    @property
+    def places(self) -> Tensor:
+        """Those that are allowed."""
+        return self.allowed.nonzero()[:, 0]
+
+    def at(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Turn, row and column."""
+        turn, rest = places // (self.height * self.width), places % (self.height * self.width)
+        return turn, rest // self.width, rest % self.width
+
+    def place(self, turn: Tensor, row: Tensor, column: Tensor, otherwise: Tensor) -> Tensor:
+        """Its index, or another one where there is no such place."""
+        inside = (row >= 0) & (row < self.height) & (column >= 0) & (column < self.width)
+        row, column = row.clamp(0, self.height - 1), column.clamp(0, self.width - 1)
+        found = (turn * self.height + row) * self.width + column
+        return torch.where(inside & self.allowed[found], found, otherwise)
+
+    def shows(self, places: Tensor) -> Tensor:
+        """What is seen one step beside a place, (...,3): there is something all around the allowed ones."""
+        return self.shown[places.clamp(0, len(self.shown) - 1)]
+
+
+def turned(planes: Tensor, angle: float, *, mode: str = "bilinear") -> tuple[Tensor, Tensor]:
+    """Planes (C,H,W) turned about their middle, by an angle from +x to +y, and where they still are, (H,W)."""
+    height, width = planes.shape[-2:]
+    y, x = (torch.arange(size, dtype=planes.dtype, device=planes.device) - (size - 1) / 2 for size in (height, width))
+    cos, sin = math.cos(angle), math.sin(angle)
+    across, down = cos * x + sin * y[:, None], cos * y[:, None] - sin * x
+    grid = torch.stack([across * 2 / max(width - 1, 1), down * 2 / max(height - 1, 1)], dim=-1)
+    found = F.grid_sample(planes[None], grid[None], mode=mode, padding_mode="border", align_corners=True)[0]
+    inside = (across.abs() <= (width - 1) / 2 + 1e-3) & (down.abs() <= (height - 1) / 2 + 1e-3)
+    return found, inside
+
+
+class _Laid:
+    """Pieces on one picture at one level, while they are being laid."""
+
+    def __init__(self, book: Book, asked: Tensor, weights: Tensor, shape: tuple[int, int], seam: float) -> None:
+        self.book, self.asked, self.weights, self.seam = book, asked, weights, seam
+        self.height, self.width = shape
+        self.sites = torch.arange(self.height * self.width, device=asked.device)
+        row, column = self.sites // self.width, self.sites % self.width
+        self.halves = [self.sites[(row + column) % 2 == part] for part in (0, 1)]
+        self.allowed = book.places
+        widest = max(2, max(book.height, book.width) // 4)
+        radii = [widest / 4**k for k in range(math.ceil(math.log(widest, 4)) + 1)]
+        self.radii = torch.tensor([max(radius, 1.0) for radius in radii], device=asked.device)
+
+    def lay(self, places: Tensor) -> None:
+        """Begin with these."""
+        self.places, self.shown = places.clone(), self.book.shown[places]
+        self.misfit = (self.weights * (self.book.compared[places] - self.asked).square()).sum(1)
+
+    def best_of(self, places: Tensor) -> Tensor:
+        """For each pixel the place that fits best, whatever is beside it."""
+        own = self.book.compared[places]
+        found = []
+        for some in self.sites.split(max(1, COMPARED // len(places))):
+            asked, weights = self.asked[some], self.weights[some]
+            misfit = weights @ own.square().T - 2 * (weights * asked) @ own.T
+            found.append(places[misfit.argmin(1)])
+        return torch.cat(found)
+
+    def _neighbour(self, sites: Tensor, dy: int, dx: int) -> tuple[Tensor, Tensor]:
+        """The pixels so far away, and whether they are in the picture."""
+        row, column = sites // self.width + dy, sites % self.width + dx
+        inside = (row >= 0) & (row < self.height) & (column >= 0) & (column < self.width)
+        return row.clamp(0, self.height - 1) * self.width + column.clamp(0, self.width - 1), inside
+
+    def offer(self, sites: Tensor, places: Tensor) -> None:
+        """Take the best of some places (N,K) at each of these pixels (N,), no two of them neighbours, if it helps."""
+        book = self.book
+        news = (places != self.places[sites, None]).any(1)
+        sites, places = sites[news], places[news]
+        if not len(sites):
+            return
+        now = self.places[sites, None]
+        misfit = (self.weights[sites, None] * (book.compared[places] - self.asked[sites, None]).square()).sum(2)
+        gain = misfit - self.misfit[sites, None]
+        before, after = self.shown[sites, None], book.shown[places]
+        for dy, dx in BESIDE:
+            beside, inside = self._neighbour(sites, dy, dx)
+            step = dy * book.width + dx
+            theirs, there = book.shows(self.places[beside] - step)[:, None], self.shown[beside, None]
+            seams = [
+                (mine - theirs).square().sum(2) + (book.shows(place + step) - there).square().sum(2)
+                for mine, place in ((after, places), (before, now))
+            ]
+            gain += self.seam * inside[:, None] * (seams[0] - seams[1])
+        gain, best = gain.min(1)
+        taken = gain < 0
+        sites, best = sites[taken], best[taken, None]
+        self.places[sites] = places[taken].gather(1, best)[:, 0]
+        self.misfit[sites] = misfit[taken].gather(1, best)[:, 0]
+        self.shown[sites] = book.shown[self.places[sites]]
+
+    def round(self, generator: torch.Generator) -> None:
+        """Offer to each pixel the pieces of its neighbours, places near its own, and some by chance."""
+        book, allowed = self.book, self.allowed
+
+        def draw(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=generator.device).to(self.asked)
+
+        def neighbours(jump: int, sites: Tensor) -> Tensor:
+            found = []
+            for dy, dx in BESIDE:
+                beside, _ = self._neighbour(sites, jump * dy, jump * dx)
+                turn, row, column = book.at(self.places[beside])
+                down, right = beside // self.width - sites // self.width, beside % self.width - sites % self.width
+                found.append(book.place(turn, row - down, column - right, self.places[sites]))
+            return torch.stack(found, dim=1)
+
+        def near(sites: Tensor) -> Tensor:
+            turn, row, column = (part[:, None] for part in book.at(self.places[sites]))
+            down, right = ((draw(len(sites), len(self.radii)) * 2 - 1) * self.radii for _ in range(2))
+            own = self.places[sites, None]
+            return book.place(turn, row + down.round().long(), column + right.round().long(), own)
+
+        def anywhere(sites: Tensor) -> Tensor:
+            count = CHANCES if len(self.sites) < SMALL else FEW
+            return allowed[(draw(len(sites), count) * len(allowed)).long().clamp(max=len(allowed) - 1)]
+
+        ways: list[Callable[[Tensor], Tensor]] = [partial(neighbours, jump) for jump in JUMPS]
+        for offers in (*ways, near, anywhere):
+            for half in self.halves:
+                for sites in half.split(AT_ONCE):
+                    self.offer(sites, offers(sites))
+
+
+@torch.no_grad()
+def lay_pieces(
+    books: Sequence[Book],
+    asked: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    *,
+    seam: float,
+    rounds: Sequence[int],
+    generator: torch.Generator,
+) -> Tensor:
+    """Choose a place of an exemplar for each pixel of a picture, from the coarsest level to the finest.
+
+    Args:      books: of each level, each twice as large as the one before.  asked, weights: (F,h,w) of each level.
+               seam: k.  rounds: of each level.  generator: of what chance offers.
+    Returns:   (H,W) indices into the last book.
+    Source:    Pritch, Kav-Venaki and Peleg, Shift-map image editing, ICCV 2009, the sum; Barnes et al., PatchMatch,
+               SIGGRAPH 2009, the offers; Besag, On the statistical analysis of dirty pictures (1986), the descent.
+    """
+    places = torch.zeros(0, dtype=torch.long)
+    before: _Laid | None = None
+    for book, wanted, weight, count in zip(books, asked, weights, rounds, strict=True):
+        flat, heavy = (plane.flatten(1).T.contiguous() for plane in (wanted, weight))
+        laid = _Laid(book, flat, heavy, (wanted.shape[1], wanted.shape[2]), seam)
+        if before is None:
+            some = (torch.rand(FIRST, generator=generator, device=generator.device) * len(book.places)).long()
+            places = laid.best_of(book.places[some.clamp(max=len(book.places) - 1).to(flat.device)])
+        else:
+            places = _finer(places, before, laid)
+        laid.lay(places)
+        for _ in range(count):
+            laid.round(generator)
+        before, places = laid, laid.places
+    assert before is not None
+    return places.view(before.height, before.width)
+
+
+def _finer(places: Tensor, coarse: _Laid, fine: _Laid) -> Tensor:
+    """Each piece at twice the size."""
+    row, column = fine.sites // fine.width, fine.sites % fine.width
+    above = (row // 2).clamp(max=coarse.height - 1) * coarse.width + (column // 2).clamp(max=coarse.width - 1)
+    turn, down, right = coarse.book.at(places[above])
+    book = fine.book
+    allowed = book.places
+    nearest = allowed[torch.searchsorted(allowed, places[above] % len(allowed)).clamp(max=len(allowed) - 1)]
+    return book.place(turn, 2 * down + row % 2, 2 * right + column % 2, nearest)
+
+
+def windows(side: int) -> Iterator[tuple[int, int, float]]:
+    """Steps of a square window, with the weights of a Gaussian of half a pixel."""
+    for dy in range(-side, side + 1):
+        for dx in range(-side, side + 1):
+            yield dy, dx, math.exp(-(dy * dy + dx * dx) / 0.5)
+
+
+def shown_by(book: Book, table: Tensor, places: Tensor) -> Tensor:
+    """What pieces show: (E,C) at places (H,W), (C,H,W); where they meet, what those around would show, averaged."""
+    height, width = places.shape
+    rows, columns = torch.arange(height, device=places.device), torch.arange(width, device=places.device)
+    total: Tensor | float = 0.0
+    weight = 0.0
+    for dy, dx, share in windows(1):
+        down, right = (rows + dy).clamp(0, height - 1) - rows, (columns + dx).clamp(0, width - 1) - columns
+        there = places[rows + down][:, columns + right] - down[:, None] * book.width - right
+        total = total + share * table[there.flatten().clamp(0, len(table) - 1)]
+        weight += share
+    return (total / weight).T.unflatten(1, (height, width))  # type: ignore[union-attr]

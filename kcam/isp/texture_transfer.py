@@ -1,0 +1,349 @@
+"""Texture transfer: a picture painted anew with pieces of another one, such as a painting."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import torch
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
+from torch.nn import functional as F
+
+from kcam.context import Context, Stage
+from kcam.inputs import check_picture, check_signal, remedy
+from kcam.isp.pieces import Book, lay_pieces, shown_by, turned
+from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.ste import clip_ste
+
+LUMA = (0.2126, 0.7152, 0.0722)
+OPPONENT = ((1.0, 0.0, -1.0), (-0.5, 1.0, -0.5))
+"""Red against blue, green against both."""
+LEVELS, ROUNDS = (8, 4, 2, 1), (12, 6, 4, 2)
+"""By how much each level is smaller, and how often its pieces are offered others."""
+LEAST = 32
+"""Pixels of an exemplar's shorter side: four of the coarsest level, of which two are no border."""
+MOST = 2**19
+"""Pixels of an exemplar: of a larger one the middle is taken. In eight turns it takes 150 MB."""
+FINE, WIDE = 2.0, 10.0
+"""Gaussians of the tone that is compared, and of what is around it [pixels]."""
+AROUND = 16.0
+"""Gaussian of the neighbourhood in which contrast is evened out [pixels]."""
+FAINT = 0.12
+"""Contrast that counts half, of the picture's."""
+EVEN = 0.05
+"""Share of its weight that the tone keeps where the picture is even: there the exemplar's own texture is free."""
+SLOPE, ALONG = 1.0, 4.0
+"""Gaussians of the slopes whose directions are compared, and of their average [pixels]."""
+FURTHER = (8.0, 16.0, 32.0)
+"""Gaussians [pixels] by which directions flow from edges into even areas."""
+FLOW_CELL = 8
+"""Pixels between random directions where there are none."""
+QUANTILES = 128
+LEAST_DEVIATION = 2e-3
+"""Of an exemplar's luma: below it is flat, and has no pieces to take."""
+
+
+def _luma(picture: Tensor) -> Tensor:
+    return torch.einsum("c,chw->hw", picture.new_tensor(LUMA), picture)
+
+
+def _blur(planes: Tensor, sigma: float) -> Tensor:
+    """(C,H,W) by a Gaussian that continues the border; a wide one on a smaller picture."""
+    shrink = max(1, 2 ** math.floor(math.log2(sigma / 2)))
+    shape = planes.shape[-2:]
+    small = planes[None]
+    if shrink > 1:
+        small = F.interpolate(small, size=[-(-side // shrink) for side in shape], mode="area")
+    reach = math.ceil(3 * sigma / shrink)
+    wide = F.pad(small, [reach] * 4, mode="replicate")
+    soft = gaussian_blur2d(wide, 2 * reach + 1, (sigma / shrink, sigma / shrink))[..., reach:-reach, reach:-reach]
+    return (F.interpolate(soft, size=shape, mode="bilinear") if shrink > 1 else soft)[0]
+
+
+def _directions(luma: Tensor) -> Tensor:
+    """Of level lines, as vectors of twice the angle times squared slope, and squared slope, (3,H,W)."""
+    soft = F.pad(_blur(luma[None], SLOPE)[None], [1] * 4, mode="replicate")[0, 0]
+    x, y = (soft[1:-1, 2:] - soft[1:-1, :-2]) / 2, (soft[2:, 1:-1] - soft[:-2, 1:-1]) / 2
+    return _blur(torch.stack([y * y - x * x, -2 * x * y, x * x + y * y]), ALONG)
+
+
+def _tones(luma: Tensor) -> Tensor:
+    """Beside what is around, and around, (2,H,W)."""
+    fine = _blur(luma[None], FINE)
+    wide = _blur(fine, WIDE)
+    return torch.cat([fine - wide, wide])
+
+
+def _standard(planes: Tensor) -> Tensor:
+    """(C,...) of mean 0 and deviation 1; nothing of what does not vary."""
+    flat = planes.flatten(1)
+    spread = flat.std(1, correction=0).clamp(min=1e-4)
+    return (planes - flat.mean(1)[:, None, None]) / spread[:, None, None]
+
+
+def _colours(picture: Tensor) -> Tensor:
+    """Of the neighbourhood, beside its brightness, (2,H,W)."""
+    return _standard(_blur(torch.einsum("nc,chw->nhw", picture.new_tensor(OPPONENT), picture), WIDE / 2))
+
+
+def _with_tones_of(values: Tensor, others: Tensor) -> Tensor:
+    """Values brought to the distribution of others, by lines between quantiles."""
+    ends = torch.linspace(0, 1, QUANTILES, dtype=values.dtype, device=values.device)
+
+    def quantiles(plane: Tensor) -> Tensor:
+        flat = plane.flatten()
+        flat = flat[:: max(1, len(flat) // 2**16)].sort().values
+        at = ends * (len(flat) - 1)
+        low = at.long().clamp(max=max(len(flat) - 2, 0))
+        return torch.lerp(flat[low], flat[(low + 1).clamp(max=len(flat) - 1)], at - low)
+
+    own, theirs = quantiles(values), quantiles(others)
+    flat = values.detach().contiguous()
+    left, right = (torch.searchsorted(own.detach(), flat, right=side) for side in (False, True))
+    index = ((left + right) // 2 - 1).clamp(0, QUANTILES - 2)  # the middle of equal ones
+    low, high = own[index], own[index + 1]
+    share = ((values - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)
+    return torch.lerp(theirs[index], theirs[index + 1], share)
+
+
+class _Exemplar:
+    """What pieces are taken from, in all turns and at all levels, and what they are compared by."""
+
+    def __init__(self, picture: Tensor, *, turns: int, detail: float, flow: float, colour: float) -> None:
+        self.picture = picture
+        luma = _luma(picture)
+        tones, slopes = _tones(luma), _directions(luma)
+        self.tone = tones.sum(0)
+        self.scales = [
+            math.sqrt(detail / max(float(tones[0].detach().var()), 1e-6)),
+            1 / max(float(self.tone.detach().std()), 1e-3),
+            math.sqrt(flow),
+            math.sqrt(colour),
+        ]
+        vectors = slopes[:2] / (slopes[2] + 1e-5)
+        planes = torch.cat([tones, _colours(picture), vectors])
+        parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in LEVELS]
+        for turn in range(turns):
+            angle = 2 * math.pi * turn / turns
+            seen, inside = turned(picture, angle, mode="bicubic")
+            found = turned(planes, angle)[0]
+            cos, sin = math.cos(2 * angle), math.sin(2 * angle)
+            along = torch.stack([cos * found[4] - sin * found[5], sin * found[4] + cos * found[5]])
+            found = torch.cat([seen.clamp(0, 1), self.scaled(torch.cat([found[:4], along])), found[:2].sum(0)[None]])
+            for level, own in zip(LEVELS, parts, strict=True):
+                small = F.avg_pool2d(found[None], level)[0]
+                whole = F.avg_pool2d(inside[None, None].to(found), level)[0, 0] > 1 - 1e-4
+                whole = F.pad(whole[None, None].to(found), [1] * 4)  # a step beyond is beyond
+                allowed = -F.max_pool2d(-whole, 3, 1)[0, 0] > 0.5
+                own.append((small[:3].flatten(1).T, small[3:].flatten(1).T, allowed.flatten()))
+        self.books, self.tones = [], Tensor()
+        for level, own in zip(LEVELS, parts, strict=True):
+            seen, compared, allowed = (torch.cat(part).contiguous() for part in zip(*own, strict=True))
+            size = (picture.shape[1] // level, picture.shape[2] // level)
+            self.tones = compared[:, 6:]
+            self.books.append(Book(seen, compared[:, :6].contiguous(), allowed, turns, *size))
+
+    def scaled(self, planes: Tensor) -> Tensor:
+        """Tone, what is around it, two colours and two of a direction, in the unit in which they are compared."""
+        fine, wide, flow, colour = self.scales
+        return torch.cat([fine * planes[:1], wide * planes[1:2], colour * planes[2:4], flow * planes[4:6]])
+
+
+def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Of a picture (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (H,W)."""
+    luma = _luma(picture)
+    soft = _blur(luma[None], FINE)
+    mean = _blur(soft, AROUND)
+    deviation = (_blur((soft - mean).square(), AROUND) + 1e-8).sqrt()
+    faint = FAINT * soft.std() + 1e-4
+    mixed = (1 - local) * _standard(soft) + local * (soft - mean) / (deviation + faint)
+    tone = _with_tones_of(mixed[0], exemplar.tone)
+    wide = _blur(tone[None], WIDE)
+    contrast = (_blur((soft - _blur(soft, 4 * FINE)).square(), 1.5 * FINE)[0] + 1e-8).sqrt()
+    weight = EVEN + (1 - EVEN) * contrast / (contrast + faint)
+    near = _directions(luma)
+    slopes = near + 0.1 * sum(_blur(near, sigma) for sigma in FURTHER)
+    known = slopes[2] / (slopes[2] + 1e-4)
+    shape = [-(-side // FLOW_CELL) + 2 for side in luma.shape]
+    chance = torch.randn(2, *shape, generator=generator, device=generator.device).to(picture)
+    chance = F.interpolate(_blur(chance, 2.0)[None], size=luma.shape, mode="bicubic")[0]
+    flow = slopes[:2] / (slopes[2] + 1e-9) * known + (1 - known) * chance / (chance.norm(dim=0).mean() + 1e-9)
+    flow = 0.8 * flow / (flow.norm(dim=0) + 1e-6)
+    asked = torch.cat([tone[None] - wide, wide, _colours(picture), flow])
+    return exemplar.scaled(asked), weight, tone
+
+
+def _transferred(picture: Tensor, exemplar: _Exemplar, options: dict[str, Any], generator: torch.Generator) -> Tensor:
+    height, width = picture.shape[-2:]
+    coarsest = LEVELS[0]
+    whole = F.pad(picture[None], (0, -width % coarsest, 0, -height % coarsest), mode="replicate")[0]
+    asked, weight, tone = _asked(whole, exemplar, options["local"], generator)
+    with torch.no_grad():
+        weights = torch.ones_like(asked)
+        weights[0] = weight
+        places = lay_pieces(
+            exemplar.books,
+            [F.avg_pool2d(asked[None], level)[0] for level in LEVELS],
+            [F.avg_pool2d(weights[None], level)[0] for level in LEVELS],
+            seam=options["seam"] / max(2 * float(exemplar.picture.detach().flatten(1).var(1).sum()), 1e-4),
+            rounds=ROUNDS,
+            generator=generator,
+        )
+    book = exemplar.books[-1]
+    painted = shown_by(book, book.shown, places)
+    glaze = options["glaze"]
+    if isinstance(glaze, Tensor) or glaze:
+        painted = painted + like(glaze, painted) * (tone - shown_by(book, exemplar.tones, places)[0])
+    return clip_ste(painted, 0.0, 1.0)[:, :height, :width]
+
+
+@in_float32
+def texture_transfer(
+    picture: Tensor,
+    *,
+    exemplar: Tensor,
+    detail: float = 3.0,
+    seam: float = 6.0,
+    flow: float = 0.5,
+    colour: float = 0.1,
+    local: float = 0.7,
+    glaze: Tensor | float = 0.0,
+    turns: int = 8,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Paint pictures anew with pieces of an exemplar, which lie where tone, direction and colour ask for them.
+
+    minimise over places:  detail w (t - t')^2 / var t' + (m - m')^2 / var t' + flow |v - v'|^2 + colour |c - c'|^2
+                           + seam |where pieces meet|^2 / (2 var)                                (`pieces`)
+
+    t is the luma beside what is around it, m that around it, both brought to the exemplar's distribution, v the
+    direction of its level lines at twice the angle, c the colour around it; those with a prime are the exemplar's, in
+    each of its turns. w is small where a picture is even: there the exemplar goes on as it is. Directions flow from
+    edges into even areas; where there are none they are drawn.
+
+    Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
+               own pixels; of more than half a megapixel the middle is taken.
+               detail, seam, flow, colour: weights, >= 0.  local: share of the contrast that is evened out, 0..1.
+               glaze: share of the picture's own tone that is laid over the pieces, >= 0.
+               turns: of the exemplar, evenly spread over a whole one; 1 leaves its strokes as they lie.
+               generator: of what chance offers; None for torch's default one.
+    Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
+               and the glaze as far as that is laid over: which piece lies where has no slope.
+    Raises:    TypeError, ValueError for what is no picture, or an exemplar that is too small or flat.
+    Source:    Efros and Freeman, Image quilting for texture synthesis and transfer, SIGGRAPH 2001, texture transfer;
+               Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns.
+
+    Example:
+    >>> stripes = (torch.arange(64) % 8 < 4).float().expand(3, 64, 64) * 0.8 + 0.1
+    >>> painted = isp.texture_transfer(torch.rand(1, 3, 32, 40), exemplar=stripes)
+    >>> painted.shape, bool(painted.std() > 0.3)  # stripes, whatever it shows
+    (torch.Size([1, 3, 32, 40]), True)
+    """
+    if picture.numel() == 0:
+        return picture
+    if generator is None:
+        generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
+    source = _Exemplar(_cropped(exemplar.to(picture)), turns=turns, detail=detail, flow=flow, colour=colour)
+    options = {"local": local, "seam": seam, "glaze": glaze}
+    return torch.stack([_transferred(one, source, options, generator) for one in picture])
+
+
+def _cropped(exemplar: Tensor) -> Tensor:
+    """The middle of an exemplar: of a size that all levels divide, and that is not too large."""
+    height, width = exemplar.shape[-2:]
+    shrink = min(1.0, math.sqrt(MOST / (height * width)))
+    tall, broad = (int(side * shrink) // LEVELS[0] * LEVELS[0] for side in (height, width))
+    top, left = (height - tall) // 2, (width - broad) // 2
+    return exemplar[:, top : top + tall, left : left + broad]
+
+
+class TextureTransfer(Stage):
+    """Texture transfer behind ToneCurve: `texture_transfer`, which paints a picture with pieces of a painting.
+
+    It learns nothing by itself: what it needs is the painting. An exemplar that is an nn.Parameter trains.
+
+    Args:      exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way; it is saved with the camera.
+               detail, seam, flow, colour: weights, >= 0.  local: 0..1.  glaze: >= 0.  turns: 1 or more.
+               seed: of what chance offers; None: from the camera's generator, each picture another one.
+    Raises:    TypeError, ValueError for an exemplar that is no picture, flat or too small, or values out of range.
+
+    Example:
+    >>> from kcam.style import painting
+    >>> camera = Camera(*Camera.phone(), isp.TextureTransfer(painting("woodcut", size=128)))
+    >>> camera(Scene.builtin("coffee", size=48)).shape
+    torch.Size([1, 3, 32, 48])
+    """
+
+    exemplar: Tensor
+    glaze: Tensor | float
+
+    def __init__(
+        self,
+        exemplar: Tensor,
+        *,
+        detail: float = 3.0,
+        seam: float = 6.0,
+        flow: float = 0.5,
+        colour: float = 0.1,
+        local: float = 0.7,
+        glaze: Tensor | float = 0.0,
+        turns: int = 8,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        check_exemplar(exemplar)
+        for name, value in (("detail", detail), ("seam", seam), ("flow", flow), ("colour", colour), ("glaze", glaze)):
+            check_not_negative(value, name=name, unit="(0 for nothing)")
+        check_not_negative(local, name="local", unit="(0 for nothing)", most=1.0)
+        for name, number, least in (("turns", turns, 1), ("seed", 0 if seed is None else seed, 0)):
+            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+                raise ValueError(f"{name} must be a whole number of at least {least}, got {number!r}.")
+        hold(self, exemplar=exemplar, glaze=glaze)
+        self.detail, self.seam, self.flow, self.colour, self.local = detail, seam, flow, colour, local
+        self.turns, self.seed = turns, seed
+
+    def mean(self) -> TextureTransfer:
+        """One picture of those that it paints, always the same, not their mean. Shares the exemplar."""
+        still = copy.copy(self)
+        still.seed = 0 if self.seed is None else self.seed
+        return still
+
+    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
+        """(B,3,H,W) sRGB in [0,1] to the same shape."""
+        check_signal(signal, channels=(3,))
+        if signal.ndim != 4 or signal.shape[1] != 3:
+            raise ValueError(
+                f"TextureTransfer repaints pictures (B,3,H,W), got shape {tuple(signal.shape)}. Put it behind the "
+                f"ToneCurve.{remedy(signal, name='signal', channels=(3,), ndims=(4,), scaled=False)}"
+            )
+        seed, told = self.seed, (context or Context()).generator
+        return texture_transfer(
+            signal,
+            exemplar=self.exemplar,
+            detail=self.detail,
+            seam=self.seam,
+            flow=self.flow,
+            colour=self.colour,
+            local=self.local,
+            glaze=self.glaze,
+            turns=self.turns,
+            generator=told if seed is None else torch.Generator("cpu").manual_seed(seed),
+        )
+
+
+def check_exemplar(exemplar: Tensor) -> None:
+    """TypeError, ValueError unless it is a picture that has pieces to take."""
+    check_picture(exemplar, name="exemplar", channels=(3,), ndims=(3,))
+    if min(exemplar.shape[-2:]) < LEAST:
+        raise ValueError(
+            f"an exemplar of {exemplar.shape[-2]} x {exemplar.shape[-1]} is too small: expected at least {LEAST} "
+            "pixels each way. Use a larger picture, not an enlarged one: strokes are measured in pixels."
+        )
+    spread = float(_luma(exemplar.detach()).std())
+    if spread < LEAST_DEVIATION:
+        raise ValueError(
+            f"the exemplar is flat: its luma deviates by {spread:.2g}, expected at least {LEAST_DEVIATION:g}. A "
+            "picture of one colour has no strokes."
+        )

@@ -1,0 +1,203 @@
+"""Pictures painted with pieces of another one: they show the exemplar, where the picture asks for it."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from kcam import Camera, Scene, isp
+from kcam.isp import pieces, texture_transfer
+from kcam.style import painting
+
+transfer: Any = importlib.import_module("kcam.isp.texture_transfer")  # the module, not the function
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def stripes(side: int = 64, *, angle: float = 0.0, period: float = 8.0) -> Tensor:
+    """Even waves whose lines run along an angle from +x to +y."""
+    y, x = torch.meshgrid(torch.arange(side) * 1.0, torch.arange(side) * 1.0, indexing="ij")
+    wave = torch.sin(2 * math.pi * (y * math.cos(angle) - x * math.sin(angle)) / period)
+    return (0.5 + 0.4 * wave).expand(3, side, side)
+
+
+def direction(picture: Tensor) -> float:
+    """Of the lines that a gray picture is made of, 0..pi."""
+    gray = picture.mean(0)
+    dx, dy = (gray[1:-1, 2:] - gray[1:-1, :-2]), (gray[2:, 1:-1] - gray[:-2, 1:-1])
+    turned = torch.atan2((2 * dx * dy).sum(), (dx * dx - dy * dy).sum())  # of the slope, twice
+    return float((turned / 2 + math.pi / 2) % math.pi)
+
+
+def between(one: float, other: float) -> float:
+    return abs((one - other + math.pi / 2) % math.pi - math.pi / 2)
+
+
+def test_a_picture_is_made_of_colours_of_the_exemplar() -> None:
+    levels = torch.tensor([0.1, 0.5, 0.9])
+    exemplar = levels[torch.arange(64) % 12 // 4].expand(3, 64, 64)
+    painted = texture_transfer(torch.rand(1, 3, 40, 48), exemplar=exemplar, turns=1, generator=seeded())
+    apart = (painted[..., None] - levels).abs().amin(-1)
+    assert float((apart < 1e-5).float().mean()) > 0.7  # the others are where two pieces meet
+    assert float(painted.min()) >= 0.1 - 1e-6
+    assert float(painted.max()) <= 0.9 + 1e-6
+
+
+def test_an_exemplar_asked_for_itself_comes_back() -> None:
+    exemplar = painting("woodcut", size=96)
+    painted = texture_transfer(exemplar[None], exemplar=exemplar, turns=1, local=0.0, seam=2.0, generator=seeded())
+    gray = torch.stack([exemplar.mean(0).flatten(), painted[0].mean(0).flatten()])
+    assert float(torch.corrcoef(gray)[0, 1]) > 0.5  # its lights and darks, of other pieces
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.2, 2.2])
+def test_strokes_follow_the_picture(angle: float) -> None:
+    """Stripes of another width: the exemplar's, turned as they are."""
+    picture = stripes(64, angle=angle, period=24.0)[None]
+    painted = texture_transfer(picture, exemplar=stripes(96, period=6.0), flow=2.0, turns=12, generator=seeded())
+    assert between(direction(painted[0]), angle) < 0.35
+    left = texture_transfer(picture, exemplar=stripes(96, period=6.0), flow=2.0, turns=1, generator=seeded())
+    assert between(direction(left[0]), 0.0) < between(direction(left[0]), angle) + 0.2 or angle < 0.5
+
+
+def test_light_and_dark_are_kept_and_more_of_them_by_more_weight() -> None:
+    picture = Scene.builtin("astronaut", size=96).to_srgb()
+    exemplar = painting("strokes", size=128)
+    kept = []
+    for detail in (0.1, 3.0, 30.0):
+        painted = texture_transfer(picture, exemplar=exemplar, detail=detail, generator=seeded())
+        soft = [torch.nn.functional.avg_pool2d(x.mean(1, keepdim=True), 4).flatten() for x in (picture, painted)]
+        kept.append(float(torch.corrcoef(torch.stack(soft))[0, 1]))
+    assert kept[0] < kept[1] < kept[2]
+    assert kept[2] > 0.6
+
+
+def test_the_same_seed_is_the_same_picture_and_another_is_another() -> None:
+    picture, exemplar = torch.rand(1, 3, 32, 32), painting("mosaic", size=64)
+    stage = isp.TextureTransfer(exemplar)
+    one, again, other = (Camera(stage)(picture, generator=seeded(seed)) for seed in (1, 1, 2))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+    still = stage.mean()
+    assert torch.equal(still(picture), still(picture))
+    assert still.exemplar is stage.exemplar
+    assert torch.equal(isp.TextureTransfer(exemplar, seed=0)(picture), still(picture))
+
+
+def test_pieces_cost_nothing_inside_and_offers_lower_the_sum() -> None:
+    """The sum by its definition, for each pair of neighbours; no round raises it."""
+    exemplar = exemplar_of(painting("woodcut", size=64))
+    book = exemplar.books[-1]
+    asked = torch.randn(12 * 10, 6, generator=seeded())
+    laid = pieces._Laid(book, asked, torch.ones_like(asked), (12, 10), seam=2.0)
+    laid.lay(book.places[torch.randint(len(book.places), (120,), generator=seeded())])
+
+    def total() -> float:
+        places = laid.places.view(12, 10)
+        found = float((book.compared[laid.places] - asked).square().sum())
+        for dy, dx in ((0, 1), (1, 0)):
+            here, there = places[: 12 - dy, : 10 - dx].flatten(), places[dy:, dx:].flatten()
+            step = dy * book.width + dx
+            found += 2.0 * float((book.shown[here] - book.shown[there - step]).square().sum())
+            found += 2.0 * float((book.shown[here + step] - book.shown[there]).square().sum())
+        return found
+
+    sums = [total()]
+    for seed in range(3):
+        laid.round(seeded(seed))
+        sums.append(total())
+        assert torch.equal(laid.shown, book.shown[laid.places])
+    assert sums[0] > sums[1] >= sums[2] >= sums[3]
+    assert bool(book.allowed[laid.places].all())
+
+
+def exemplar_of(picture: Tensor, turns: int = 8):
+    return transfer._Exemplar(picture, turns=turns, detail=3.0, flow=0.5, colour=0.1)
+
+
+def test_directions_turn_with_the_exemplar() -> None:
+    """Those of a turned picture are the turned ones."""
+    exemplar = exemplar_of(stripes(96, angle=0.4, period=6.0), turns=8)
+    book = exemplar.books[-1]
+    for turn in range(8):
+        own = (torch.arange(len(book.allowed)) // (book.height * book.width) == turn) & book.allowed
+        vector = book.compared[own, 4:6].mean(0)
+        found = float(torch.atan2(vector[1], vector[0]) / 2 % math.pi)
+        assert between(found, 0.4 + turn * math.pi / 4) < 0.1
+        seen = book.shown.view(8, book.height, book.width, 3)[turn, 30:66, 30:66].permute(2, 0, 1)
+        assert between(direction(seen), 0.4 + turn * math.pi / 4) < 0.08
+
+
+def test_gradients_of_exemplar_glaze_and_picture() -> None:
+    """Where no piece moves, against differences: float64."""
+    exemplar = nn.Parameter(painting("woodcut", size=64).double() * 0.8 + 0.1)
+    glaze = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    picture = (0.2 + 0.6 * torch.rand(1, 3, 16, 16, dtype=torch.float64, generator=seeded())).requires_grad_()
+    weights = torch.randn(1, 3, 16, 16, dtype=torch.float64, generator=seeded(1))
+
+    def painted(*values: Tensor) -> Tensor:
+        one, two, three = values
+        return (weights * texture_transfer(one, exemplar=two, glaze=three, turns=2, generator=seeded())).sum()
+
+    given = (picture, exemplar, glaze)
+    slopes = torch.autograd.grad(painted(*given), given)
+    for index, (value, slope) in enumerate(zip(given, slopes, strict=True)):
+        assert bool(slope.isfinite().all())
+        assert float(slope.abs().max()) > 0
+        along = torch.randn(value.shape, dtype=torch.float64, generator=seeded(2))
+        step = 1e-7
+        ends = [painted(*(v.detach() + sign * step * along if i == index else v.detach() for i, v in enumerate(given)))
+                for sign in (1, -1)]  # fmt: skip
+        assert float((ends[0] - ends[1]) / (2 * step)) == pytest.approx(float((slope * along).sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 8)])
+@pytest.mark.parametrize("value", [0.0, 0.5, None])
+def test_pictures_of_any_size_and_even_ones(shape: tuple[int, int], value: float | None) -> None:
+    picture = torch.rand(2, 3, *shape) if value is None else torch.full((2, 3, *shape), value)
+    painted = texture_transfer(picture, exemplar=painting("strokes", size=64), generator=seeded())
+    assert painted.shape == picture.shape
+    assert bool(painted.isfinite().all())
+
+
+def test_half_precision_and_large_exemplars() -> None:
+    exemplar = torch.rand(3, 800, 900)
+    assert isp.texture_transfer(torch.rand(1, 3, 16, 16).half(), exemplar=exemplar).dtype == torch.float16
+    assert 3 * 2**18 < transfer._cropped(exemplar).numel() <= 3 * 2**19
+
+
+def test_saved_and_loaded_it_paints_the_same(tmp_path) -> None:
+    camera = Camera(isp.TextureTransfer(painting("watercolour", size=64), turns=4, glaze=0.1, seed=3))
+    camera.save(tmp_path / "camera.safetensors")
+    picture = torch.rand(1, 3, 24, 24)
+    assert torch.equal(Camera.load(tmp_path / "camera.safetensors")(picture), camera(picture))
+
+
+@pytest.mark.parametrize(
+    ("exemplar", "arguments", "text"),
+    [
+        (torch.rand(3, 16, 64), {}, r"16 x 64 is too small: expected at least 32"),
+        (torch.full((3, 64, 64), 0.5), {}, r"flat: its luma deviates by 0, .* no strokes"),
+        (255 * torch.rand(3, 64, 64), {}, r"exemplar has values from .* / 255"),
+        (torch.rand(64, 64, 3), {}, r"exemplar has shape"),
+        (torch.rand(3, 64, 64), {"detail": -1.0}, r"detail must be"),
+        (torch.rand(3, 64, 64), {"local": 2.0}, r"local must be"),
+        (torch.rand(3, 64, 64), {"turns": 0}, r"turns must be a whole number of at least 1, got 0"),
+        (torch.rand(3, 64, 64), {"seed": -1}, r"seed must be a whole number of at least 0, got -1"),
+    ],
+)
+def test_what_cannot_be_painted_with(exemplar: Tensor, arguments: dict, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        isp.TextureTransfer(exemplar, **arguments)
+
+
+def test_it_repaints_pictures_only() -> None:
+    with pytest.raises(ValueError, match=r"TextureTransfer repaints pictures \(B,3,H,W\)"):
+        isp.TextureTransfer(torch.rand(3, 64, 64))(torch.rand(1, 1, 8, 8))
