@@ -263,7 +263,8 @@ class Camera(nn.Module):
                    generator: source of all noise; None for torch's default one.
         Returns:   (N,B,C,H,W): N pictures as `forward` gives them.
         Raises:    ValueError for no exposures, or some that are not > 0, a camera without an Exposure, or with a Motion
-                   of its own beside `motion`, and a motion along a path, which has an end; TypeError for no Motion.
+                   of its own beside `motion`, and a motion along a path, which has an end; TypeError for exposures that
+                   are no list of numbers, or no Motion.
 
         Example:
         >>> bracket = Camera.phone().burst(Scene.builtin("coffee", size=32), exposures=[0.25, 1.0, 4.0])

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.units import WAVELENGTH_RANGE, nm, wavelength_grid
+from kcam.units import WAVELENGTH_RANGE, check_flag, nm, wavelength_grid
 
 SINGLE_BAND_WIDTH = 10 * nm
 """Width of a band that has no neighbour to reach half-way to."""
@@ -76,6 +76,7 @@ def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> Spectral
     >>> (table.wavelengths / nm).round().tolist(), table.values.tolist(), table.names
     ([440.0, 450.0, 470.0], [[0.0, 1.0, 0.0]], ('power',))
     """
+    check_flag(percent, name="percent")
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}. Expected a table of spectra, .csv.")

@@ -32,7 +32,7 @@ from kcam.precision import full_precision
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import hold
 from kcam.sensor.transmission import Transmission
-from kcam.units import check_trained, nm, wavelength_grid
+from kcam.units import check_flag, check_trained, nm, wavelength_grid
 
 BASIS_SIZE = 12
 SPACING = 300 * nm / (BASIS_SIZE - 1)
@@ -235,6 +235,7 @@ class ColourFilter(Stage):
         >>> silicon.response(torch.tensor([450.0, 800.0, 1100.0]) * nm)  # half-way, half-way, and outside
         tensor([[0.4500, 0.3500, 0.0000]], dtype=torch.float64)
         """
+        check_flag(quantum_efficiency, name="quantum_efficiency")
         nodes = spectral.rising(wavelengths, either_way=True)
         if not isinstance(curves, Tensor) or curves.ndim != 2 or curves.shape[1] != len(nodes) or not len(curves):
             got = tuple(curves.shape) if isinstance(curves, Tensor) else _describe(curves)

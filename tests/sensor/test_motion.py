@@ -376,6 +376,9 @@ class TestBurst:
         ):
             with pytest.raises(ValueError, match=text):
                 shot.burst(scene, **arguments)
+        for given in (0.01, None, ["a"], "12", [[1.0, 2.0]], [True]):
+            with pytest.raises(TypeError, match=r"exposures must be a list of numbers such as \[0.25, 1, 4\].*Got "):
+                camera.burst(scene, exposures=given)
         with pytest.raises(TypeError, match=r"motion must be a sensor.Motion"):
             camera.burst(scene, exposures=[1.0], motion=(1.0, 0.0))
 
