@@ -48,6 +48,7 @@ PIXELS = (
     sensor.RowColumnNoise,
     sensor.Nonlinearity,
 )
+"""What happens to the electrons of pixels, before any of them is developed."""
 Kinds = tuple[type[nn.Module], ...]
 PLACES: tuple[tuple[Kinds, Kinds, Kinds], ...] = (
     ((sensor.Transmission,), (optics.Imaging,), (sensor.ColourFilter,)),
