@@ -12,7 +12,7 @@ from kcam import optics, sensor
 from kcam.camera import Camera
 from kcam.scene import Scene
 from kcam.sensor.noise import check_not_negative
-from kcam.units import check_positive
+from kcam.units import as_numbers, check_positive
 
 SEEDS = 2**63 - 1
 
@@ -28,12 +28,14 @@ def burst(
 ) -> Tensor:
     """See `Camera.burst`.
 
+    Raises:    TypeError, ValueError: see there.
+
     Example:
     >>> from kcam.burst import burst
     >>> burst(Camera.ideal(), Scene.builtin("coffee", size=16), exposures=[1.0, 2.0]).shape
     torch.Size([2, 1, 3, 10, 16])
     """
-    factors = [float(exposure) for exposure in exposures]
+    factors = _as_exposures(exposures)
     if not factors:
         raise ValueError("there are no exposures: expected one for each picture, such as exposures=[0.25, 1, 4].")
     for factor in factors:
@@ -64,6 +66,16 @@ def burst(
         shot = Camera(*stages, context=told)
         pictures.append(shot(still, generator=torch.Generator(still.device).manual_seed(seed)))
     return torch.stack(pictures)
+
+
+def _as_exposures(exposures: Any) -> list[float]:
+    try:
+        return [float(as_numbers(one, name="exposures", expected="numbers")) for one in exposures]
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(
+            "exposures must be a list of numbers such as [0.25, 1, 4], one for each picture: seconds for a camera with "
+            f"Exposure(time=...), else times its own exposure. Got {exposures!r}."
+        ) from None
 
 
 def _still_until(camera: Camera) -> int:

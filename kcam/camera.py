@@ -36,7 +36,29 @@ ORDER: tuple[type[nn.Module] | tuple[type[nn.Module], ...], ...] = (
     isp.ColourMatrix,
     isp.ToneCurve,
 )
-"""Stages that a light path passes once each, in this order. All others may stand anywhere, any number of times."""
+"""Stages that a light path passes once each, in this order. All others stand any number of times: see `PLACES`."""
+PIXELS = (
+    sensor.MicrolensShading,
+    sensor.Crosstalk,
+    sensor.DefectPixels,
+    sensor.DarkCurrent,
+    sensor.ShotNoise,
+    sensor.FixedPattern,
+    sensor.ReadNoise,
+    sensor.RowColumnNoise,
+    sensor.Nonlinearity,
+)
+"""What happens to the electrons of pixels, before any of them is developed."""
+Kinds = tuple[type[nn.Module], ...]
+PLACES: tuple[tuple[Kinds, Kinds, Kinds], ...] = (
+    ((sensor.Transmission,), (optics.Imaging,), (sensor.ColourFilter,)),
+    ((sensor.Motion, optics.VeilingGlare), (optics.Imaging,), (sensor.Mosaic, *DEVELOPING)),
+    (PIXELS, (optics.Imaging, sensor.ColourFilter), DEVELOPING),
+    (FINISHING, (optics.Imaging, sensor.ColourFilter, sensor.Mosaic, sensor.ADC, *DEMOSAICING), ()),
+)
+"""(stages, those of a camera that they stand behind, those that they stand before); all others may stand anywhere."""
+_TAKES = {optics.Imaging: "a scene", sensor.ColourFilter: "bands", **dict.fromkeys(DEMOSAICING, "a mosaic")}
+_LEAVES = {sensor.ColourFilter: "which leaves no bands", sensor.Mosaic: "where pixels have one colour each"}
 
 
 class Camera(nn.Module):
@@ -242,7 +264,8 @@ class Camera(nn.Module):
                    generator: source of all noise; None for torch's default one.
         Returns:   (N,B,C,H,W): N pictures as `forward` gives them.
         Raises:    ValueError for no exposures, or some that are not > 0, a camera without an Exposure, or with a Motion
-                   of its own beside `motion`, and a motion along a path, which has an end; TypeError for no Motion.
+                   of its own beside `motion`, and a motion along a path, which has an end; TypeError for exposures that
+                   are no list of numbers, or no Motion.
 
         Example:
         >>> bracket = Camera.phone().burst(Scene.builtin("coffee", size=32), exposures=[0.25, 1.0, 4.0])
@@ -439,7 +462,7 @@ def _rgb_sensor(*, full_well: float, read_noise: float, bits: int = 10, black_le
 
 
 def _check_order(stages: Sequence[nn.Module]) -> None:
-    last, before = -1, ""
+    last, previous = -1, ""
     for stage in stages:
         rank = next((rank for rank, cls in enumerate(ORDER) if isinstance(stage, cls)), None)
         if rank is None:
@@ -448,20 +471,49 @@ def _check_order(stages: Sequence[nn.Module]) -> None:
         if rank == last:
             raise ValueError(f"the camera has two {name} stages: light passes one. Remove one of them.")
         if rank < last:
-            raise ValueError(f"{name} stands after {before}, but light passes it first. Move it before {before}.")
-        last, before = rank, name
-    glass = sensor.Transmission
-    for stage, *behind in (stages[index:] for index in range(len(stages))):
-        if isinstance(stage, glass) and any(isinstance(one, optics.Imaging) for one in behind):
-            raise ValueError("Transmission stands before Imaging, which takes a scene. Move it behind Imaging.")
-        if isinstance(stage, sensor.ColourFilter) and any(isinstance(one, glass) for one in behind):
-            raise ValueError("Transmission stands after ColourFilter, which leaves no bands. Move it before it.")
-        if isinstance(stage, sensor.Motion) and any(isinstance(one, optics.Imaging) for one in behind):
-            raise ValueError("Motion stands before Imaging, which takes a scene. Move it behind Imaging.")
-        mosaiced = isinstance(stage, sensor.Mosaic) or (isinstance(stage, sensor.ColourFilter) and stage.is_tile)
-        if mosaiced and any(isinstance(one, sensor.Motion) for one in behind):
-            name = type(stage).__name__
-            raise ValueError(f"Motion stands after {name}, where pixels have one colour each. Move it before {name}.")
+            raise ValueError(f"{name} stands after {previous}, but light passes it first. Move it before {previous}.")
+        last, previous = rank, name
+    for index, stage in enumerate(stages):
+        name = type(stage).__name__
+        for behind, before in ((behind, before) for kinds, behind, before in PLACES if isinstance(stage, kinds)):
+            for other in reversed(stages[index + 1 :]):
+                if kind := _acts_as(other, behind):
+                    there, takes = type(other).__name__, _TAKES.get(kind, "the sensor's signal")
+                    raise ValueError(f"{name} stands before {there}, which takes {takes}. Move it behind {there}.")
+            for other in stages[:index]:
+                if kind := _acts_as(other, before):
+                    there, why = type(other).__name__, _LEAVES.get(kind, "where the raw signal has ended")
+                    raise ValueError(f"{name} stands after {there}, {why}. Move it before {there}.")
+    _check_planes(stages)
+
+
+def _acts_as(stage: nn.Module, kinds: Kinds) -> type[nn.Module] | None:
+    """Which of them it is; a filter that is a tile is a mosaic."""
+    if sensor.Mosaic in kinds and isinstance(stage, sensor.ColourFilter) and stage.is_tile:
+        return sensor.Mosaic
+    return next((kind for kind in kinds if isinstance(stage, kind)), None)
+
+
+def _check_planes(stages: Sequence[nn.Module]) -> None:
+    """Where pixels have one colour each, and where they have all there is."""
+    mosaiced = gray = False
+    for stage in stages:
+        name = type(stage).__name__
+        if gray and isinstance(stage, (sensor.Mosaic, *DEMOSAICING)):
+            raise ValueError(
+                f"a monochrome camera needs no {name}: behind a ColourFilter of one curve each pixel has all there is. "
+                f"Leave {name} out."
+            )
+        if mosaiced and isinstance(stage, FINISHING):
+            raise ValueError(
+                f"{name} stands on a mosaic, where pixels have one colour each. Put isp.Demosaic() before."
+            )
+        if _acts_as(stage, (sensor.Mosaic,)):
+            mosaiced = True
+        elif isinstance(stage, sensor.ColourFilter):
+            gray = stage.output_channels(0) == 1
+        elif not (type(stage).__module__.startswith("kcam.sensor.") or isinstance(stage, isp.Clip)):
+            mosaiced = gray = False  # what it makes of the planes is its own
 
 
 def _same_curves(told: Any, own: Any) -> bool:

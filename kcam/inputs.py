@@ -179,6 +179,21 @@ def scale_remedy(low: float, high: float, *, name: str) -> str:
     return _sentence(*_scale(low, high, name))
 
 
+def table_remedy(values: Tensor, *, name: str, most: float) -> str:
+    """What was got in the place of a table's values from 0 to `most`, and what to do about it."""
+    bad = int((~values.isfinite()).sum())
+    if bad:
+        keep = f"keep = {name}.isfinite(){'.all(0)' if values.ndim > 1 else ''}"
+        fix = f"Leave their wavelengths out: {keep}, then wavelengths[keep] and {name}[..., keep]."
+        return f"got {bad} that are NaN or infinite. {fix}"
+    low, high = (float(bound) for bound in values.aminmax())
+    if high > 1.1 * most:  # more than noise
+        fix = f"Percent? Then divide by 100: {name} / 100, or percent=True for a file."
+    else:
+        fix = f"Measured noise is no light: clamp it, {name}.clamp(0, {most:g})."
+    return f"got {low:g} to {high:g}. {fix}"
+
+
 def channels_last(shape: Sequence[int]) -> bool:
     """Whether (..., H, W, C) is the likelier reading of a shape that is given as (..., C, H, W)."""
     sides = tuple(shape[-3:-1])

@@ -17,6 +17,7 @@ import functools
 import itertools
 import math
 import os
+import warnings
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.units import WAVELENGTH_RANGE, nm, wavelength_grid
+from kcam.units import WAVELENGTH_RANGE, check_flag, nm, wavelength_grid
 
 SINGLE_BAND_WIDTH = 10 * nm
 """Width of a band that has no neighbour to reach half-way to."""
@@ -60,7 +61,8 @@ def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> Spectral
     Columns are parted by commas, semicolons or tabs; empty lines and those that begin with # are passed over. What a
     column means is for whom it is given to: `illuminant`, `sensor.Transmission`, `sensor.ColourFilter.from_curves`.
 
-    Args:      percent: whether values are percent; they are divided by 100.
+    Args:      percent: whether values are percent; they are divided by 100. A UserWarning says so where none is above 1
+               and no header speaks of percent.
     Returns:   wavelengths (L,) rising float64 [m], values (C, L) float64, the names of the columns.
     Raises:    ValueError that names the file and the line: without a header or numbers, with rows of unequal length,
                wavelengths that are no nanometres (micrometres, metres, angstroms) or come twice, values that are no
@@ -74,6 +76,7 @@ def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> Spectral
     >>> (table.wavelengths / nm).round().tolist(), table.values.tolist(), table.names
     ([440.0, 450.0, 470.0], [[0.0, 1.0, 0.0]], ('power',))
     """
+    check_flag(percent, name="percent")
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}. Expected a table of spectra, .csv.")
@@ -99,6 +102,12 @@ def read_csv(path: str | os.PathLike[str], *, percent: bool = False) -> Spectral
         table, rows = table.flip(0), rows[::-1]
     _check_nanometres(path, [number for number, _ in rows], table[:, 0].tolist(), names[0])
     values = table[:, 1:].T.contiguous()
+    if percent and not said and 0 < values.max() <= 1:
+        warnings.warn(
+            f"{path}: the highest value is {values.max():g}, and percent=True divides it by 100. If these are shares, "
+            "0..1, leave percent=True off; if they are percent, write % into the header.",
+            stacklevel=3,
+        )
     return SpectralTable(table[:, 0] * nm, values / 100 if percent else values, tuple(names[1:]))
 
 

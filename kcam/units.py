@@ -35,6 +35,8 @@ PIXEL_PITCH_RANGE = (1e-7, 1e-3)
 DOE_PITCH_RANGE = (1e-8, 5e-2)
 FAR = 300.0
 """Metres from which a depth without anything nearer is warned of: in millimetres it would be 0.3 m."""
+IMAGE_SIDE_RANGE = (1e-5, 2.0)
+"""Of a focal length, or of a pupil from the sensor, that is given without a lens [m]: in millimetres it is outside."""
 LEAST_DISTANCE = 1e-7
 """Of an object, and of a focal length [m]: the shortest wavelength; far below, powers of 1 / distance overflow."""
 
@@ -82,6 +84,8 @@ def as_numbers(value: Any, *, name: str, expected: str) -> Tensor:
     tensor([1.0000, 2.5000], dtype=torch.float64)
     """
     try:
+        if isinstance(value, bool):
+            raise TypeError("a flag is no number")
         return torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         fix = " Write a number, not text." if isinstance(value, str) else ""
@@ -123,6 +127,30 @@ def check_length(value: Tensor | float, *, name: str, within: tuple[float, float
             f"{_perhaps(metres, _unit_of(metres, within=within, example=example), example=example)}"
         )
     return metres
+
+
+def percent_hint(value: float) -> str:
+    """What a share above 1 was probably meant to be.
+
+    Example:
+    >>> from kcam.units import percent_hint
+    >>> percent_hint(30)
+    ' It is a share, not percent; did you mean 0.3?'
+    """
+    return f" It is a share, not percent; did you mean {value / 100:g}?" if 1 < value <= 100 else ""
+
+
+def check_flag(value: Any, *, name: str) -> None:
+    """TypeError unless it is True or False: any text is true, "no" as well.
+
+    Example:
+    >>> from kcam.units import check_flag
+    >>> check_flag("no", name="rounding")
+    Traceback (most recent call last):
+    TypeError: rounding must be True or False, got 'no'.
+    """
+    if not isinstance(value, bool):
+        raise TypeError(f"{name} must be True or False, got {value!r}.")
 
 
 def check_pixel_pitch(pitch: float) -> float:

@@ -14,6 +14,7 @@ from commands import fails, run
 
 from kcam import Camera, isp, optics, sensor, spectral
 from kcam import analysis as A
+from kcam.camera import PRESETS
 from kcam.units import mm, um
 
 
@@ -170,6 +171,9 @@ def test_any_camera_gets_a_report(stages: list) -> None:
 def test_the_command_writes_the_page(tmp_path: Path) -> None:
     said = run("report", "ideal", "--out", tmp_path / "a.html", "--json", tmp_path / "a.json")
     assert "MTF50" in said
+    assert "Shading: not measured, " in said  # and why
+    helped = " ".join(run("report", "--help").split())
+    assert all(name in helped for name in (*PRESETS, "singlet"))
     assert (tmp_path / "a.html").stat().st_size > 10_000
     assert json.loads((tmp_path / "a.json").read_text())["name"] == "ideal"
     assert "expected e.g. --size 3000x4000" in fails("report", "ideal", "--size", "big", "--out", tmp_path / "b.html")

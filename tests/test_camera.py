@@ -153,6 +153,78 @@ def test_bad_order() -> None:
         Camera(sensor.ColourFilter.kodak(), optics.Imaging(lens(), pixel_pitch=4 * um))
 
 
+RAW_STAGES = (
+    sensor.RowColumnNoise(),
+    sensor.DefectPixels(),
+    sensor.DarkCurrent(1.0, time=0.01),
+    sensor.Nonlinearity(),
+    sensor.MicrolensShading(pupil_distance=5 * mm),
+    sensor.Crosstalk(),
+    sensor.ReadNoise(1.0),
+)
+FINISHING = (isp.JPEG(), isp.Sharpen(), isp.LocalToneMapping(), isp.Denoise())
+
+
+def named(stage: nn.Module) -> str:
+    return type(stage).__name__
+
+
+@pytest.mark.parametrize("stage", RAW_STAGES, ids=named)
+def test_what_pixels_do_stands_between_the_filter_and_the_demosaic(stage: nn.Module) -> None:
+    name, stages, ideal = named(stage), [*full_camera()], [*Camera.ideal()]
+    with pytest.raises(ValueError, match=f"{name} stands before ColourFilter, which takes bands. Move it behind Col"):
+        Camera(stages[0], stage, *stages[1:])
+    with pytest.raises(ValueError, match=f"{name} stands before .*which takes a scene. Move it behind"):
+        Camera(stage, stages[0])
+    for place, there in ((8, "Demosaic"), (len(stages), "Demosaic")):
+        with pytest.raises(ValueError, match=f"{name} stands after {there}, .*raw signal has ended. Move it before"):
+            Camera(*stages[:place], stage, *stages[place:])
+    with pytest.raises(ValueError, match=f"{name} stands after ToneCurve"):
+        Camera(ideal[0], ideal[-1], stage)
+    for place in (2, 3, 6):
+        Camera(*stages[:place], stage, *stages[place:])
+    assert Camera(stage)(torch.full((1, 1, 6, 6), 0.5)).shape == (1, 1, 6, 6)
+
+
+@pytest.mark.parametrize("stage", FINISHING, ids=named)
+def test_what_finishes_a_picture_stands_behind_its_demosaic(stage: nn.Module) -> None:
+    name, stages = named(stage), [*full_camera()]
+    for place in (1, 2, 4, 7):
+        with pytest.raises(ValueError, match=f"{name} stands before Demosaic, which takes a mosaic. Move it behind"):
+            Camera(*stages[:place], stage, *stages[place:])
+    for raw in (stages[:7], [sensor.ColourFilter.learned(tile=4), isp.Clip()]):
+        with pytest.raises(ValueError, match=f"{name} stands on a mosaic.* Put isp.Demosaic\\(\\) before"):
+            Camera(*raw, stage)
+    Camera(*stages[:7], nn.Identity(), stage)  # which may be a demosaic of the user's
+    for kept in (stages[:8], [*Camera.ideal()][:2], monochrome()):
+        assert Camera(*kept, stage)(rgb_scene(16, 16)).shape[-2:] == (16, 16)
+    with pytest.raises(ValueError, match=f"{name} stands before ADC, which takes the sensor's signal"):
+        Camera(*monochrome()[:-1], stage, monochrome()[-1])
+
+
+def test_glare_stands_before_the_mosaic() -> None:
+    stages, glare = [*full_camera()], optics.VeilingGlare(focal_length=8 * mm)
+    for place, there in ((3, "Mosaic.*one colour each"), (len(stages), "Mosaic")):
+        with pytest.raises(ValueError, match=f"VeilingGlare stands after {there}.* Move it before"):
+            Camera(*stages[:place], glare, *stages[place:])
+    with pytest.raises(ValueError, match="VeilingGlare stands after WhiteBalance"):
+        Camera(*Camera.ideal(), glare)
+    for place in (1, 2):
+        Camera(*stages[:place], glare, *stages[place:])
+
+
+def monochrome() -> list[nn.Module]:
+    curve = sensor.ColourFilter.from_curves(torch.tensor([400.0, 700.0]) * nm, torch.tensor([[0.6, 0.6]]))
+    return [curve, sensor.Exposure(), sensor.ShotNoise(full_well=5_000), sensor.ADC(bits=12)]
+
+
+@pytest.mark.parametrize("stage", [isp.Demosaic(), isp.LearnedDemosaic(), sensor.Mosaic()], ids=named)
+def test_a_monochrome_camera_needs_no_mosaic(stage: nn.Module) -> None:
+    place = 1 if isinstance(stage, sensor.Mosaic) else 4
+    with pytest.raises(ValueError, match=f"monochrome camera needs no {named(stage)}: .*Leave {named(stage)} out"):
+        Camera(*monochrome()[:place], stage, *monochrome()[place:])
+
+
 @pytest.mark.parametrize("scene", ["photo.jpg", None, torch.zeros(1, 3, 4, 4).numpy()])
 def test_no_scene(scene: Any) -> None:
     with pytest.raises(TypeError, match=r"a camera takes a Scene or a tensor \(B,L,H,W\), got .*Scene.from_rgb"):

@@ -234,8 +234,8 @@ AUGMENTATIONS: dict[str, Door] = {
     }.items()
 }
 AUGMENTATIONS |= {
-    "RandomLensDistortion": Door(KC.RandomLensDistortion(p=1.0), SCALED | {"alpha"}),
-    "RandomRollingShutter": Door(KC.RandomRollingShutter(p=1.0), SCALED | {"alpha"}),
+    "RandomLensDistortion": Door(KC.RandomLensDistortion(p=1.0), frozenset({"alpha"})),
+    "RandomRollingShutter": Door(KC.RandomRollingShutter(p=1.0), frozenset({"alpha"})),
     "CameraSequential": Door(
         KC.CameraSequential(KC.RandomExposure(p=1.0)),
         ARRAYS,

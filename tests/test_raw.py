@@ -102,6 +102,12 @@ def test_gains_and_matrix_of_the_camera_s_own_stages_count() -> None:
         assert (raw.camera_to_srgb.sum(1) - 1).abs().max() < 1e-12
 
 
+def test_it_prints_shapes_not_pixels() -> None:
+    raw = Raw(torch.full((1, 1, 64, 64), 100.0), "RGGB", 64.0, 1023.0, neutral=torch.tensor([0.6, 1.0, 0.8]))
+    assert str(raw).startswith("Raw(mosaic=(1, 1, 64, 64), pattern='RGGB', black_level=64.0, white_level=1023.0, neut")
+    assert len(str(raw)) < 200
+
+
 def test_numbers_are_those_of_the_adc() -> None:
     camera, scene, raw = taken(5)
     bits = camera[5].bits

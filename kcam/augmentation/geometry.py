@@ -15,7 +15,7 @@ from kornia.geometry.keypoints import Keypoints
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from kcam.augmentation.base import Checked, check_probability, on_drawn_rows
+from kcam.augmentation.base import Checked, check_probability, check_values, is_picture, on_drawn_rows
 from kcam.augmentation.distributions import Bounds, Draw, Draws, Uniform
 from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.precision import full_precision
@@ -128,7 +128,20 @@ class SmoothlyMoved(MovedPixels):
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """The picture, or a mask with resample nearest: each pixel from where the ideal lens has it."""
+        """The picture: each pixel from where the ideal lens has it."""
+
+        def effect(rows: Tensor, own: dict[str, Tensor]) -> Tensor:
+            if rows.numel():
+                check_values(rows, picture=is_picture(rows) and "linear" not in params)
+            return self._remapped(rows, own, flags, inverse=False)
+
+        drawn = {name: params[name] for name in self._param_generator.draws}
+        return on_drawn_rows(input, params, drawn, effect, p=self.p)
+
+    def apply_transform_mask(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """As a picture, with resample nearest, and any values: of classes, or of a depth that is NaN here and there."""
         drawn = {name: params[name] for name in self._param_generator.draws}
         return on_drawn_rows(
             input, params, drawn, lambda rows, own: self._remapped(rows, own, flags, inverse=False), p=self.p

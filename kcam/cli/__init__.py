@@ -17,7 +17,7 @@ from rich.console import Console
 
 from kcam import __version__, memory
 from kcam.cli.calibration import calibrate_sensor
-from kcam.cli.console import complain, err, losses, one_line_errors, progress
+from kcam.cli.console import CAMERAS, complain, err, losses, one_line_errors, progress
 from kcam.cli.data import app as data_app
 from kcam.cli.report import report
 
@@ -44,9 +44,7 @@ StyleSizeOption = Annotated[
     int, typer.Option("--style-size", min=0, help="shrink the style to this longer side [pixels]; 0: as it is")
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="of the noise")]
-CameraOption = Annotated[
-    str, typer.Option("--camera", help="thesis, ideal, phone, singlet, or a file that Camera.save wrote")
-]
+CameraOption = Annotated[str, typer.Option("--camera", help=CAMERAS)]
 
 
 def length(

@@ -15,11 +15,14 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from kcam.camera import PRESETS
 from kcam.inputs import named
 
 ALL_DONE, SOME_FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 OFTEN, SELDOM, SHARE = 1.0, 10.0, 0.05
 """A line of progress: none before so many seconds are over, and one after so many, or after this share of the work."""
+CAMERAS = f"{', '.join(PRESETS)}, singlet, or a file that Camera.save wrote"
+"""What `open_camera` takes, for the help."""
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from kcam.cli.console import one_line_errors, progress
+from kcam.cli.console import CAMERAS, one_line_errors, progress
 
 
 def report(
-    camera: Annotated[str, typer.Argument(help="thesis, ideal, phone, singlet, or a file that Camera.save wrote")],
+    camera: Annotated[str, typer.Argument(help=CAMERAS)],
     out: Annotated[Path, typer.Option("--out", help="the page to write: .html")] = Path("report.html"),
     size: Annotated[
         str, typer.Option("--size", help="of the sensor, height x width [pixels], for the field: 3000x4000")
@@ -41,6 +41,7 @@ def report(
         found.save(out)
         if json is not None:
             found.to_json(json)
-        for row in found.table()[1:]:
-            typer.echo(f"{row[0]}: {row[1]}")
+        for what, value, method in found.table()[1:]:
+            why = f", {method}" if value == "not measured" else ""
+            typer.echo(f"{what}: {value}{why}")
         typer.echo(out)

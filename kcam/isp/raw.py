@@ -76,7 +76,7 @@ D65_LIGHT, NO_BLACK_RENDER = 21, 1
 Tag = tuple[int, str, int, Any, bool]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Raw:
     """What a sensor recorded, and what its picture needs: one picture, as it lies on the sensor (not turned).
 
@@ -157,6 +157,12 @@ class Raw:
         for name, unit in (("exposure_time", "s"), ("iso", "(100 is base)")):
             if getattr(self, name) is not None:
                 check_positive(getattr(self, name), name=name, unit=unit)
+
+    def __repr__(self) -> str:
+        """What is known of it; tensors by their shapes."""
+        held = {name: value for name, value in vars(self).items() if value is not None}
+        shown = (f"{name}={tuple(v.shape) if isinstance(v, Tensor) else repr(v)}" for name, v in held.items())
+        return f"Raw({', '.join(shown)})"
 
     def _checked_black(self) -> float | Tensor:
         values = as_numbers(self.black_level, name="black_level", expected="a number of DN such as 64").detach().cpu()

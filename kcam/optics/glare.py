@@ -23,7 +23,7 @@ from kcam.effects import relative_change
 from kcam.inputs import check_signal
 from kcam.optics.elements.element import set_scalar
 from kcam.optics.numerics import Scalar, float64, legendre
-from kcam.units import as_numbers, check_positive, nm, wavelength_grid
+from kcam.units import IMAGE_SIDE_RANGE, as_numbers, check_length, nm, percent_hint, wavelength_grid
 
 GLARE_BORDERS = ("mirror", "zero")
 _NEAR, _INSIDE, _TURN = 24, 5, 48  # pixels that are integrated, nodes in each, and in half a right angle
@@ -251,7 +251,8 @@ class VeilingGlare(Stage):
         for name, (value, least, most) in (bounds | {"power": (power, 0.0, 4.0)}).items():
             number = as_numbers(value, name=name, expected=f"a number from {least:g} to {most:g}").detach()
             if number.numel() != 1 or not least <= float(number) <= most:
-                raise ValueError(f"{name} must be a number from {least:g} to {most:g}, got {_shown(number)}.")
+                hint = percent_hint(float(number)) if name == "share" and number.numel() == 1 else ""
+                raise ValueError(f"{name} must be a number from {least:g} to {most:g}, got {_shown(number)}.{hint}")
             set_scalar(self, name, value)
         self.wavelength = float(wavelength_grid([wavelength])[0])
         if border not in GLARE_BORDERS:
@@ -260,7 +261,7 @@ class VeilingGlare(Stage):
         if focal_length is None:
             self.focal_length = None
         else:
-            check_positive(focal_length, name="focal_length")
+            check_length(focal_length, name="focal_length", within=IMAGE_SIDE_RANGE, example="8 * mm")
             set_scalar(self, "focal_length", focal_length)
         self._cache = ValueCache()
 

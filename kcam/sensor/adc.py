@@ -12,7 +12,7 @@ from kcam.cache import is_plain
 from kcam.context import Context, Stage
 from kcam.sensor.noise import DarkCurrent, ShotNoise, check_not_negative, hold, in_float32, like
 from kcam.ste import clip_ste, round_ste
-from kcam.units import check_positive
+from kcam.units import check_flag, check_positive
 
 
 @in_float32
@@ -91,7 +91,7 @@ class ADC(Stage):
                clamp_black: whether values below the black level are cut to it, as cameras do that subtract it before
                they write: a noise sigma then lifts the dark by sigma / sqrt(2 pi), which no later stage can tell from
                light. A `Plan` never leaves it out.
-    Raises:    TypeError for bits that are no integer; ValueError for a value out of range.
+    Raises:    TypeError for bits that are no integer, or a flag that is none; ValueError for a value out of range.
 
     Example:
     >>> adc = sensor.ADC(bits=12, black_level=64)
@@ -126,6 +126,8 @@ class ADC(Stage):
                 f"black_level {highest:g} DN leaves no range: expected less than full scale, "
                 f"{2**bits - 1} DN at {bits} bits. Black levels are in DN, not in shares of full scale."
             )
+        check_flag(rounding, name="rounding")
+        check_flag(clamp_black, name="clamp_black")
         if gain is not None:
             check_positive(gain, name="gain", unit="(1 at base ISO)")
         hold(self, bits=bits, black_level=black_level, gain=gain, rounding=rounding, clamp_black=clamp_black)

@@ -27,12 +27,12 @@ from torch.nn import functional as F
 
 from kcam import spectral
 from kcam.context import Context, Stage
-from kcam.inputs import band_remedy, check_signal
+from kcam.inputs import band_remedy, check_signal, table_remedy
 from kcam.precision import full_precision
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import hold
 from kcam.sensor.transmission import Transmission
-from kcam.units import check_trained, nm, wavelength_grid
+from kcam.units import check_flag, check_trained, nm, wavelength_grid
 
 BASIS_SIZE = 12
 SPACING = 300 * nm / (BASIS_SIZE - 1)
@@ -197,8 +197,12 @@ class ColourFilter(Stage):
         if not coefficients.isfinite().all() or (not softplus and (coefficients < 0).any()):
             raise ValueError(
                 f"coefficients must be finite{'' if softplus else ' and >= 0'}: light is absorbed, never negative. "
-                f"Got values from {coefficients.min().item():g} to {coefficients.max().item():g}; "
-                "clamp them, or pass softplus=True for unconstrained ones."
+                + (
+                    f"Got values from {coefficients.min().item():g} to {coefficients.max().item():g}; "
+                    "clamp them, or pass softplus=True for unconstrained ones."
+                    if coefficients.isfinite().all()
+                    else f"{int((~coefficients.isfinite()).sum())} are NaN or infinite: give what was measured there."
+                )
             )
         if not 1 * nm <= width <= 1000 * nm:
             raise ValueError(
@@ -231,6 +235,7 @@ class ColourFilter(Stage):
         >>> silicon.response(torch.tensor([450.0, 800.0, 1100.0]) * nm)  # half-way, half-way, and outside
         tensor([[0.4500, 0.3500, 0.0000]], dtype=torch.float64)
         """
+        check_flag(quantum_efficiency, name="quantum_efficiency")
         nodes = spectral.rising(wavelengths, either_way=True)
         if not isinstance(curves, Tensor) or curves.ndim != 2 or curves.shape[1] != len(nodes) or not len(curves):
             got = tuple(curves.shape) if isinstance(curves, Tensor) else _describe(curves)
@@ -238,11 +243,9 @@ class ColourFilter(Stage):
         values = curves.detach().double().cpu()
         most, unit = (1.0, " electrons per photon") if quantum_efficiency else (2.0, "")
         if not values.isfinite().all() or (values < 0).any() or (values > most).any():
-            high = float(values.nan_to_num(0).max())
-            percent = " Percent? Then divide by 100: curves / 100, or percent=True for a file." if high > most else ""
             raise ValueError(
-                f"curves must be finite, >= 0 and at most {most:g}{unit}, got {values.min():g} to {values.max():g}."
-                f"{percent or ' Measured noise below 0 is no light: clamp it, curves.clamp(min=0).'}"
+                f"curves must be finite, >= 0 and at most {most:g}{unit}, "
+                f"{table_remedy(values, name='curves', most=most)}"
             )
         if not values.any():
             raise ValueError("curves are all 0: this sensor sees nothing. Give its responses, such as 0.5 at 550 nm.")

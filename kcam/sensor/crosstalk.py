@@ -7,6 +7,7 @@ a 3 x 3 of shares that belong to the pixel that the light fell on, so behind a m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -17,7 +18,7 @@ from kcam.context import Context, Stage
 from kcam.effects import relative_change
 from kcam.sensor.mosaic import at_pixels
 from kcam.sensor.noise import hold, in_float32
-from kcam.units import as_numbers
+from kcam.units import as_numbers, percent_hint
 
 
 def crosstalk_kernel(optical: Tensor | float, electrical: Tensor | float) -> Tensor:
@@ -132,8 +133,12 @@ class Crosstalk(Stage):
         for name, values in shares.items():
             bad = ~((values >= 0) & (values <= 1))
             if values.ndim > 1 or not values.numel() or bad.any():
-                what = f"{float(values[bad].flatten()[0]):g}" if bad.any() else f"shape {tuple(values.shape)}"
-                raise ValueError(f"{name} must be a share from 0 to 1, or one for each channel (C,), got {what}.")
+                worst = float(values[bad].max()) if bad.any() else math.nan
+                what = f"{worst:g}" if bad.any() else f"shape {tuple(values.shape)}"
+                raise ValueError(
+                    f"{name} must be a share from 0 to 1, or one for each channel (C,), got {what}."
+                    f"{percent_hint(worst)}"
+                )
         counts = {values.numel() for values in shares.values()} - {1}
         if len(counts) > 1:
             raise ValueError(f"optical and electrical are for {max(counts)} and {min(counts)} channels; give as many.")

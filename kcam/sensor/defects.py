@@ -20,7 +20,7 @@ from kcam.sensor.noise import (
     in_float32,
     like,
 )
-from kcam.units import as_numbers
+from kcam.units import as_numbers, percent_hint
 
 
 def defect_fields(shape: tuple[int, ...], *, seed: int) -> tuple[Tensor, Tensor]:
@@ -119,7 +119,8 @@ class DefectPixels(Stage):
             number = as_numbers(value, name=name, expected="a share of the pixels such as 1e-4").detach()
             if number.numel() != 1 or not 0 <= float(number) <= 1:
                 shown = f"{float(number):g}" if number.numel() == 1 else f"{number.numel()} of them"
-                raise ValueError(f"{name} must be a share of the pixels from 0 to 1, such as 1e-4, got {shown}.")
+                hint = percent_hint(float(number.max())) if number.numel() == 1 else ""
+                raise ValueError(f"{name} must be a share of the pixels from 0 to 1, such as 1e-4, got {shown}.{hint}")
             shares[name] = float(number)
         if sum(shares.values()) > 1:
             raise ValueError(f"hot, dead and stuck are {sum(shares.values()):g} of the pixels together, more than all.")

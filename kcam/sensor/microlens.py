@@ -20,7 +20,7 @@ from kcam.optics.regions import pixel_positions
 from kcam.sensor.crosstalk import _numbers
 from kcam.sensor.mosaic import at_pixels
 from kcam.sensor.noise import hold, in_float32
-from kcam.units import as_numbers, check_positive
+from kcam.units import IMAGE_SIDE_RANGE, as_numbers, check_length
 
 
 def microlens_response(
@@ -107,7 +107,7 @@ class MicrolensShading(Stage):
             raise ValueError(f"acceptance must be 0.01 to pi / 2 rad, a number or one each (C,), got {shown}{fix}")
         for name, distance in (("design_distance", design_distance), ("pupil_distance", pupil_distance)):
             if distance is not None:
-                check_positive(distance, name=name)
+                check_length(distance, name=name, within=IMAGE_SIDE_RANGE, example="5 * mm")
         place = as_numbers(centre, name="centre", expected="x and y in metres, such as (0.0, 0.0)").flatten()
         if len(place) != 2 or not bool((place.abs() < 1).all()):
             raise ValueError(f"centre must be x and y on the sensor, less than 1 m, got {centre!r}. * mm?")

@@ -257,8 +257,10 @@ class Motion(Stage):
                many as the motion asks for, `STEP` apart.
     Raises:    ValueError for none or several of the first four, shapes or values that are none, a time <= 0, a negative
                readout; at the call for a flow of another size than the picture, no exposure time, or no depth.
-    Valid for light that the pixels sample without aliasing. A flow of one velocity is off by 1 % of the picture's
-    second derivative, in pixels, at most.
+    Valid for light that the pixels sample without aliasing. What is sharper rings, to negative light: by half a pixel
+    of motion a step from 0 to 1 goes down to -0.10, a single pixel of 1 to -0.15; a star behind an f/3 lens on pixels
+    of 1.4 um to -3 % of its peak. A flow of one velocity is off by 1 % of the picture's second derivative, in pixels,
+    at most.
 
     Example:
     >>> wall = torch.zeros(1, 3, 8, 64)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcam import spectral
 from kcam.context import Context, Stage
-from kcam.inputs import check_signal
+from kcam.inputs import check_signal, table_remedy
 from kcam.sensor.noise import hold
 from kcam.units import check_trained
 
@@ -54,10 +54,7 @@ class Transmission(Stage):
             raise ValueError(f"values must be a tensor ({len(nodes)},), one share per wavelength, got {got}.")
         shares = values.detach()
         if not ((shares >= 0) & (shares <= 1)).all():
-            percent = (
-                " Percent? Then divide by 100, or read the file with percent=True." if (shares > 1.5).any() else ""
-            )
-            raise ValueError(f"values must be shares, 0..1, got {shares.min():g} to {shares.max():g}.{percent}")
+            raise ValueError(f"values must be shares, 0..1, {table_remedy(shares, name='values', most=1.0)}")
         hold(self, values=values)
         self.wavelengths = nodes  # no buffer: half precision has no number so small
 

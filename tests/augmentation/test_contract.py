@@ -60,6 +60,29 @@ def test_the_table_has_every_augmentation() -> None:
     assert {type(case()) for case in CASES} == public
 
 
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_each_refuses_another_scale_and_what_is_not_finite(case: Case) -> None:
+    augment = case(p=1.0)
+    for wrong, text in (
+        (picture() * 255, r"expected sRGB in \[0,1\]. Use image / 255"),
+        (picture() - 3, r"expected sRGB in \[0,1\].*normalised by mean"),
+        (picture() * torch.nan, "expected finite ones. Remove NaN and inf"),
+        (picture().index_fill(0, torch.tensor([1]), torch.inf), "expected finite ones. Remove NaN and inf"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            augment(wrong)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.geometric and not case.slow], ids=lambda c: c.name)
+def test_masks_may_have_any_values(case: Case) -> None:
+    pipeline = K.AugmentationSequential(case(p=1.0), data_keys=["input", "mask"])
+    mask = torch.full((2, 1, *SIZE), 200.0)
+    mask[..., 8:10, 8:12] = torch.nan
+    moved = pipeline(picture(), mask)[1]
+    assert moved.isnan().any()
+    assert moved.nan_to_num(0).max() == 200
+
+
 class TestShapes:
     @table_of_channels()
     def test_shape_and_type(self, case: Case, channels: int, device: torch.device) -> None:

@@ -310,7 +310,9 @@ def test_a_camera_with_glare_is_saved_and_is_linear(tmp_path: Path) -> None:
         (lambda: optics.VeilingGlare(torch.ones(2)), r"share must be .* got 2 of them"),
         (lambda: optics.VeilingGlare(wavelength=550), r"did you mean 550 \* nm"),
         (lambda: optics.VeilingGlare(border="reflect"), r"unknown border 'reflect'; known: mirror, zero"),
-        (lambda: optics.VeilingGlare(focal_length=-1.0), r"focal_length must be finite and > 0 m, got -1"),
+        (lambda: optics.VeilingGlare(10), r"share must be .*got 10. It is a share, not percent; did you mean 0.1\?"),
+        (lambda: optics.VeilingGlare(0.1, focal_length=8), r"focal_length 8 is outside .*did you mean 8 \* mm\?"),
+        (lambda: optics.VeilingGlare(focal_length=-1.0), r"focal_length -1 is outside .* such as 8 \* mm"),
         (lambda: optics.VeilingGlare()(torch.rand(1, 1, 4, 4)), r"no lens that says so: .* give focal_length=50 \* mm"),
         (
             lambda: optics.VeilingGlare(focal_length=8 * mm)(

@@ -249,13 +249,36 @@ class TestMonochrome:
         ([4e-7, 5e-7], [0.1, 0.2], r"curves must be a tensor \(C, 2\)"),
         ([4e-7, 5e-7], [[10.0, 45.0]], "got 10 to 45. Percent"),
         ([4e-7, 5e-7], [[0.1, -0.2]], "clamp it"),
-        ([4e-7, 5e-7], [[0.1, float("nan")]], "curves must be finite"),
+        ([4e-7, 5e-7], [[0.1, 2.004]], r"got 0.1 to 2.004. Measured noise.* curves.clamp\(0, 2\)"),
+        ([4e-7, 5e-7], [[0.1, float("nan")]], r"curves must be finite.*got 1 that are NaN.*keep = curves.isfinite\(\)"),
         ([4e-7, 5e-7], [[0.0, 0.0]], "sees nothing"),
     ],
 )
 def test_curves_that_are_none(wavelengths: list[float], curves: list, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         ColourFilter.from_curves(torch.tensor(wavelengths), torch.tensor(curves))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (float("nan"), r"values must be shares, 0..1, got 1 that are NaN or infinite. Leave .*values\[..., keep\]"),
+        (1.004, r"got 0.1 to 1.004. Measured noise is no light: clamp it, values.clamp\(0, 1\)"),
+        (-0.01, r"got -0.01 to 0.1. Measured noise"),
+        (45.0, "got 0.1 to 45. Percent"),
+    ],
+)
+def test_transmissions_that_are_none(value: float, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Transmission(torch.tensor([4e-7, 5e-7]), torch.tensor([0.1, value]))
+
+
+def test_what_an_error_about_nan_says_works() -> None:
+    wavelengths, curves = torch.tensor([4e-7, 5e-7, 6e-7]), torch.tensor([[0.1, float("nan"), 0.2], [0.1, 0.3, 0.4]])
+    keep = curves.isfinite().all(0)
+    assert ColourFilter.from_curves(wavelengths[keep], curves[..., keep]).coefficients.shape == (2, 2)
+    with pytest.raises(ValueError, match="1 are NaN or infinite: give what was measured"):
+        ColourFilter(curves, nodes=wavelengths)
 
 
 def test_more_than_an_electron_per_photon_is_none() -> None:
@@ -297,6 +320,16 @@ def test_a_table_in_percent_that_does_not_say_so(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"table.csv: .*got 50 to 60. Percent\? Then.*percent=True"):
             read(path)
         read(path, percent=True)
+
+
+def test_a_table_of_shares_is_not_in_percent(tmp_path: Path) -> None:
+    path = write(tmp_path, "nm,a\n400,0.5\n600,0.6\n")
+    for read in (ColourFilter.from_csv, Transmission.from_csv):
+        with pytest.warns(UserWarning, match=r"table.csv: the highest value is 0.6.*leave percent=True off"):
+            read(path, percent=True)
+        read(path)
+    dark = write(tmp_path, "nm,a [%]\n400,0.5\n600,0.6\n")  # glass that lets little through, and says so
+    assert float(Transmission.from_csv(dark, percent=True).values.max()) == pytest.approx(0.006)
 
 
 def test_tables_as_spreadsheets_write_them(tmp_path: Path) -> None:

@@ -376,8 +376,23 @@ class TestBurst:
         ):
             with pytest.raises(ValueError, match=text):
                 shot.burst(scene, **arguments)
+        for given in (0.01, None, ["a"], "12", [[1.0, 2.0]], [True]):
+            with pytest.raises(TypeError, match=r"exposures must be a list of numbers such as \[0.25, 1, 4\].*Got "):
+                camera.burst(scene, exposures=given)
         with pytest.raises(TypeError, match=r"motion must be a sensor.Motion"):
             camera.burst(scene, exposures=[1.0], motion=(1.0, 0.0))
+
+
+def test_sharp_content_rings_as_the_docstring_says() -> None:
+    motion = Motion((0.5, 0.0), time=1.0)
+    step, pixel = torch.zeros(2, 1, 1, 16, 64)
+    step[..., 32:], pixel[..., 8, 32] = 1, 1
+    assert float(motion(step).min()) == pytest.approx(-0.10, abs=0.005)
+    assert float(motion(pixel).min()) == pytest.approx(-0.15, abs=0.006)
+    lens = optics.Lens(optics.CircularAperture(8 * mm / 3), optics.ThinLens(8 * mm), focus_distance=2.0)
+    light = Scene.from_rgb(pixel[0].expand(3, -1, -1), depth=2.0)
+    star = Camera(optics.Imaging(lens, pixel_pitch=1.4 * um), sensor.ColourFilter.kodak())(light)[:, 1:2]
+    assert float(motion(star).min() / star.max()) == pytest.approx(-0.03, abs=0.005)
 
 
 class TestTremor:
