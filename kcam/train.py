@@ -10,7 +10,7 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -30,6 +30,8 @@ fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 SHOWN = ("astronaut", "coffee", "chelsea")
 SHOWN_SIZE = 256
 FEATURES = ("steerable", "vgg16")
+PAINTING = (isp.StyleStage, isp.TextureTransfer)
+"""Stages behind the camera that paint."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,13 @@ class Options:
     style: a picture's path, or the name of one of `kcam.style.STYLES`. out: the camera to write, .safetensors; beside
     it stands a folder of its name with checkpoints, pictures and the report. patches: a patch store; photos: a folder
     of photographs; neither: the built-in scenes. camera: a saved one to start from. features: "steerable" or "vgg16",
-    with vgg_weights. stage: False takes the style stage off. style_size: longer side that the style is shrunk to; None:
+    with vgg_weights. stage: False takes off what paints, network or pieces. style_size: longer side that the style is shrunk to; None:
     as it is.
     """
 
     style: str
     out: str = "styled.safetensors"
-    preset: str = "quick"
+    preset: str = "pieces"
     patches: str | None = None
     photos: str | None = None
     camera: str | None = None
@@ -137,6 +139,7 @@ def run(
         loss = preset.style_loss(picture.to(device), features=features.to(device), crop=settings.size, **weights).to(
             device
         )
+        paints = isp.TextureTransfer(picture).to(device) if preset.pieces and options.stage else None
         start = _camera(options, preset)
         scenes = [Scene.builtin(name, SHOWN_SIZE).with_depth(2.0).to(device=device) for name in SHOWN]
         if leads:
@@ -146,8 +149,9 @@ def run(
         figures: dict[str, Any] = {}  # of the last checkpoint
 
         def show(camera: Camera, step: int, history: Tensor) -> None:
+            whole = _with(camera, paints)
             figures.update(
-                _show(camera, step, history, folder=folder, picture=picture, scenes=scenes, start=start, loss=loss)
+                _show(whole, step, history, folder=folder, picture=picture, scenes=scenes, start=start, loss=loss)
             )
 
         with warnings.catch_warnings(), _stopping() as stopped:
@@ -166,6 +170,7 @@ def run(
         if leads and trained.finished:
             if not figures:  # nothing was left to train
                 show(trained.camera, len(trained.history), trained.history)
+            trained = replace(trained, camera=_with(trained.camera, paints))
             trained.camera.cpu().save(out)
             _write_report(folder / "report.html", options, settings, trained, figures)
         elif leads:
@@ -196,10 +201,14 @@ def _show(
 
 
 def _camera(options: Options, preset: style.Preset) -> Camera:
+    """What is to be trained."""
     camera = preset.camera() if options.camera is None else Camera.load(options.camera)
-    if options.stage:
-        return camera
-    return Camera(*(stage for stage in camera if not isinstance(stage, isp.StyleStage)), context=camera.context)
+    off = PAINTING if preset.pieces or not options.stage else (isp.TextureTransfer,)
+    return Camera(*(stage for stage in camera if not isinstance(stage, off)), context=camera.context)
+
+
+def _with(camera: Camera, paints: isp.TextureTransfer | None) -> Camera:
+    return camera if paints is None else Camera(*camera, paints, context=camera.context)
 
 
 def _source(options: Options, preset: style.Preset) -> style.Source:
@@ -356,6 +365,7 @@ def _write_report(path: Path, options: Options, settings: Any, trained: style.Tr
         advice=trained.advice,
         notes=[
             "A camera alone can bring the colours of a style, not its strokes: its optics only take detail away, its "
-            "filter and matrix act on each pixel. What brings strokes is the style stage, a network behind the camera."
+            "filter and matrix act on each pixel. What brings strokes stands behind it: pieces of the style itself, or a "
+            "network."
         ],
     )

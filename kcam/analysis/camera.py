@@ -147,7 +147,7 @@ def _behind(camera: Camera) -> Camera:
 def _raw_part(camera: Camera) -> Camera:
     """From the light on the pixels to the raw."""
     after = _behind(camera)
-    ends = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve, isp.StyleStage)
+    ends = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve, isp.StyleStage, isp.TextureTransfer)
     end = next((index for index, stage in enumerate(after) if isinstance(stage, ends)), len(after))
     return after[:end]
 

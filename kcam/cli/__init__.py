@@ -407,7 +407,7 @@ def train(
     out: Annotated[Path, typer.Option("--out", help="the camera to write; its run's folder stands beside it")] = Path(
         "styled.safetensors"
     ),
-    preset: Annotated[str, typer.Option("--preset", help="quick, standard or thesis")] = "quick",
+    preset: Annotated[str, typer.Option("--preset", help="pieces, quick, standard or thesis")] = "pieces",
     photos: Annotated[
         str,
         typer.Option("--photos", help="a folder of your own photographs to train on; else kcam's few built-in ones"),
@@ -416,7 +416,9 @@ def train(
         str, typer.Option("--patches", help="a patch store of spectral cubes to train on, in place of photographs")
     ] = "",
     camera: Annotated[str, typer.Option("--camera", help="a saved camera to start from")] = "",
-    stage: Annotated[bool, typer.Option("--stage/--no-stage", help="with a style stage, or the camera alone")] = True,
+    stage: Annotated[
+        bool, typer.Option("--stage/--no-stage", help="with what paints behind the camera, or the camera alone")
+    ] = True,
     features: FeaturesOption = "steerable",
     vgg_weights: WeightsOption = "",
     style_size: StyleSizeOption = 0,
@@ -490,39 +492,71 @@ def paint(
         str, typer.Option("--style", help="a picture, or strokes, mosaic, woodcut, watercolour")
     ] = "strokes",
     out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("painted.png"),
-    start: Annotated[str, typer.Option("--start", help="photo, or noise: from what to paint")] = "",
+    by: Annotated[
+        str,
+        typer.Option("--by", help="pieces of the style, in seconds; or loss: the picture itself is optimised"),
+    ] = "",
+    start: Annotated[str, typer.Option("--start", help="by loss: photo, or noise: from what to paint")] = "",
     features: FeaturesOption = "steerable",
     vgg_weights: WeightsOption = "",
     style_size: StyleSizeOption = 0,
     size: Annotated[int, typer.Option("--size", min=64, help="longer side of the painting, at most [pixels]")] = 512,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="of the optimiser")] = 200,
-    content: Annotated[float, typer.Option("--content", min=0.0, help="weight of what the photo shows")] = 0.3,
+    steps: Annotated[int, typer.Option("--steps", min=0, help="by loss: of the optimiser; 0: 200")] = 0,
+    content: Annotated[
+        float, typer.Option("--content", help="by loss: weight of what the photo shows; -1: 0.3")
+    ] = -1.0,
     seed: SeedOption = 0,
 ) -> None:
-    """Paint a photograph in the manner of a style, or a texture of the style: the picture itself is optimised."""
+    """Paint a photograph in the manner of a style: with pieces of it, or by a loss, as a texture of the style alone is.
+
+    Any option that is of the loss, or no photograph, means --by loss.
+    """
     with one_line_errors():
-        from kcam import files, plots, train
+        import torch
+
+        from kcam import files, isp, plots, train
         from kcam.scene import read_picture
         from kcam.style import StyleLoss
         from kcam.style import paint as optimise
 
+        of_loss = [
+            name
+            for name, given in (
+                ("--start", start), ("--features", features != "steerable"), ("--vgg-weights", vgg_weights),
+                ("--steps", steps), ("--content", content >= 0),
+            )
+            if given
+        ]  # fmt: skip
+        by = by or ("loss" if of_loss or not photo else "pieces")
+        if by not in ("pieces", "loss"):
+            raise ValueError(f'unknown way to paint "{by}": expected pieces or loss.')
+        if by == "pieces" and (of_loss or not photo):
+            raise ValueError(
+                f"--by pieces takes no {of_loss[0]}." if of_loss else "--by pieces needs a photograph to paint."
+            )
         plots.check_writable(out)
         for given in (photo, style):
             files.check_other(out, given)
         picture = train.style_picture(style, size=style_size or None)
-        layers = train.style_features(features, vgg_weights or None)
-        loss = StyleLoss(picture, features=layers, content=content if photo else 0.0, colour=1.0)
         shown = train.shrunk(read_picture(photo).expand(3, -1, -1), size) if photo else None
-        with progress("step", steps) as advance:
-            painted = optimise(
-                loss,
-                photo=shown,
-                shape=(size, size),
-                start=start or None,
-                steps=steps,
-                seed=seed,
-                advance=lambda _, terms: advance(losses(terms)),
-            )
+        if by == "pieces" and shown is not None:
+            with torch.no_grad():
+                generator = torch.Generator().manual_seed(seed)
+                painted = isp.texture_transfer(shown[None], exemplar=picture, generator=generator)[0]
+        else:
+            layers = train.style_features(features, vgg_weights or None)
+            weight = 0.3 if content < 0 else content
+            loss = StyleLoss(picture, features=layers, content=weight if photo else 0.0, colour=1.0)
+            with progress("step", steps or 200) as advance:
+                painted = optimise(
+                    loss,
+                    photo=shown,
+                    shape=(size, size),
+                    start=start or None,
+                    steps=steps or 200,
+                    seed=seed,
+                    advance=lambda _, terms: advance(losses(terms)),
+                )
         plots.write_picture(painted, out)
         typer.echo(out)
 

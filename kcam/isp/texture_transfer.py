@@ -207,9 +207,9 @@ def texture_transfer(
     detail: float = 3.0,
     seam: float = 6.0,
     flow: float = 0.5,
-    colour: float = 0.1,
+    colour: float = 0.0,
     local: float = 0.7,
-    glaze: Tensor | float = 0.0,
+    glaze: Tensor | float = 0.2,
     turns: int = 8,
     generator: torch.Generator | None = None,
 ) -> Tensor:
@@ -243,6 +243,7 @@ def texture_transfer(
     """
     if picture.numel() == 0:
         return picture
+    check_exemplar(exemplar)
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
     source = _Exemplar(_cropped(exemplar.to(picture)), turns=turns, detail=detail, flow=flow, colour=colour)
@@ -286,9 +287,9 @@ class TextureTransfer(Stage):
         detail: float = 3.0,
         seam: float = 6.0,
         flow: float = 0.5,
-        colour: float = 0.1,
+        colour: float = 0.0,
         local: float = 0.7,
-        glaze: Tensor | float = 0.0,
+        glaze: Tensor | float = 0.2,
         turns: int = 8,
         seed: int | None = None,
     ) -> None:

@@ -55,6 +55,7 @@ DOES: tuple[tuple[type[nn.Module] | tuple[type[nn.Module], ...], str], ...] = (
     (isp.Clip, "limited to 0..1"),
     (isp.Convolution, "a small kernel over all channels"),
     (isp.StyleStage, "painted anew"),
+    (isp.TextureTransfer, "painted with pieces"),
 )
 """What the stages do, in a few words; of others their docstring tells it."""
 
@@ -271,7 +272,7 @@ def cut(
 
 
 def _is_coded(behind: Sequence[nn.Module]) -> bool:
-    return any(isinstance(stage, (isp.ToneCurve, isp.StyleStage)) for stage in behind)
+    return any(isinstance(stage, (isp.ToneCurve, isp.StyleStage, isp.TextureTransfer)) for stage in behind)
 
 
 def _tile(planes: Tensor, behind: Sequence[nn.Module]) -> np.ndarray | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -81,7 +82,8 @@ THESIS_L2 = 300.0
 class Preset:
     """A way to train. note: for the help. camera: makes it. loss: arguments of `StyleLoss`. settings: of `fit`.
 
-    epochs: where it is these that are given, not the steps.
+    epochs: where it is these that are given, not the steps. pieces: whether the trained camera paints with pieces of
+    the style, by an `isp.TextureTransfer` behind it, which needs no training.
 
     Example:
     >>> from kcam.style import PRESETS
@@ -95,6 +97,7 @@ class Preset:
     loss: dict[str, Any]
     settings: Settings
     epochs: int | None = None
+    pieces: bool = False
 
     def style_loss(self, picture: Tensor, *, features: nn.Module | None = None, **changes: Any) -> StyleLoss:
         """The loss for a style picture, with some of its arguments changed."""
@@ -127,14 +130,21 @@ A face has less contrast than what is around it: with the default `flat` some ca
 """
 
 PRESETS: dict[str, Preset] = {
+    "pieces": Preset(
+        "the camera alone is trained, and paints with pieces of the style: a minute on a laptop",
+        partial(style_camera, stage=False),
+        PAINTED,
+        Settings(steps=150),
+        pieces=True,
+    ),
     "quick": Preset(
-        "built-in scenes, 128 pixels: minutes on a laptop",
+        "a network paints; built-in scenes, 128 pixels: minutes on a laptop",
         style_camera,
         PAINTED,
         Settings(steps=600, content_aim=AIM),
     ),
     "standard": Preset(
-        "built-in scenes, 256 pixels, more steps",
+        "a network paints; built-in scenes, 256 pixels, more steps",
         style_camera,
         PAINTED,
         Settings(steps=1000, size=256, content_aim=AIM),
