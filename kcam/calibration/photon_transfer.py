@@ -507,7 +507,7 @@ def _check_bits(bits: int | None, highest: float, piled: float, steps: int, note
             f"Divide the frames by {steps}."
         )
     if highest <= 255 and (bits is None or (piled > 0.01 and highest == 255)):
-        dim = "" if bits else " If they are no more than dim, say bits, such as 12, or take brighter flats."
+        dim = "" if bits else " If the frames are only that dim, say bits, such as 12, or take brighter flats."
         raise ValueError(
             f"the highest value of all frames is {highest:g} DN: 8-bit numbers, whatever the files hold, and what is "
             f"left of a noise there is rounding. Save the raw with all its bits.{dim}"

@@ -41,8 +41,8 @@ def calibrate_sensor(
 
         if context.args:  # a shell put a pattern's files in its place; whose they are is lost
             raise ValueError(
-                f"got {len(context.args)} names that follow no option, such as {context.args[0]}: the shell took a "
-                'pattern for its files. Put patterns in quotes: --darks "d*.tif" --flats "f*.tif".'
+                f"got {len(context.args)} names that follow no option, such as {context.args[0]}: the shell "
+                'put the files of a pattern in its place. Put patterns in quotes: --darks "d*.tif" --flats "f*.tif".'
             )
         for option, given in (("--darks", darks), ("--flats", flats)):
             if not given:

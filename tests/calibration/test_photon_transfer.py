@@ -277,7 +277,7 @@ def spoilt(flats: np.ndarray, value: float) -> np.ndarray:
         ({"flats": GOOD.flats >> 4, "darks": GOOD.darks >> 4}, "8-bit numbers, whatever the files hold"),
         (
             {"flats": GOOD.flats >> 4, "darks": GOOD.darks >> 4, "bits": None},
-            "the highest value of all frames is 255 DN: 8-bit numbers, .* Save the raw with all its bits. If they are",
+            "the highest value of all frames is 255 DN: 8-bit numbers, .* with all its bits. If the frames are",
         ),
         ({"flats": GOOD.flats * 16, "darks": GOOD.darks * 16}, "all values are multiples of 16: 12-bit numbers"),
         ({"bits": 10}, "the highest value is 4095 DN, above 1023, full scale of 10 bits|saturated pixels"),
@@ -302,7 +302,7 @@ def test_frames_that_are_no_more_than_dim_are_taken_where_bits_say_so() -> None:
     assert frames.flats.max() <= 255
     gain = found(frames, bits=12).channels["mono"].gain
     assert abs(gain.value - 0.1) < 3 * gain.standard_error
-    with pytest.raises(ValueError, match="8-bit numbers, .* If they are no more than dim, say bits, such as 12"):
+    with pytest.raises(ValueError, match="8-bit numbers, .* If the frames are only that dim, say bits, such as 12"):
         found(frames, bits=None)
 
 
