@@ -39,6 +39,7 @@ def draw(seed: int, *, pattern: str | None = None, clamp: bool = False, **given:
         "well": rng.uniform(0.4, 1.6),  # of what the converter holds
         "falloff": rng.choice([0.0, 0.2]),
         "brightest": 1.3,  # of saturation
+        "dark_times": [0.01, 0.1, 1.0],
         "bend": 0.0,  # relative loss at saturation
         "late": False,  # whether the pixels' gains differ behind the well, so that dark electrons have a pattern too
     } | given
@@ -64,7 +65,7 @@ def draw(seed: int, *, pattern: str | None = None, clamp: bool = False, **given:
     shares = np.linspace(of["brightest"] / of["levels"], of["brightest"], of["levels"])
     if pattern and of["brightest"] > 1:
         shares = np.append(shares, 3.0)
-    times, dark_times = [0.1 * share for share in shares], [0.01, 0.1, 1.0]
+    times, dark_times = [0.1 * share for share in shares], of["dark_times"]
     return Frames(
         np.stack([[frame(saturation * share, time) for _ in "ab"] for share, time in zip(shares, times, strict=True)]),
         np.stack([[frame(0.0, time) for _ in "ab"] for time in dark_times]),

@@ -8,6 +8,7 @@ s_k: the patches' white balanced raw, a perfect white = 1; t_k: their linear sRG
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ from kcam.units import as_numbers
 ROWS, COLUMNS = 4, 6
 _MIDDLE = 0.5  # of a patch's width: what is averaged
 _FEWEST = 4  # pixels of a channel in a patch
+_LEVEL = 1e-6  # relative: values at the converter's end
 _SATURATED = 0.01  # share of a patch's pixels
 _UNEVEN, _DARK = 0.2, 0.03  # spread in a patch: of its own mean, and of the brightest patch
 _GRAYS = slice(18, 24)  # from white to black
@@ -112,7 +114,8 @@ def chart_patches(
                patch (top left) over that of bluish green (top right) and black (bottom right) to white (bottom left);
                the middle of the first pixel is (0, 0).
                pattern: of the mosaic, as of `sensor.Mosaic`.
-               saturation: value at which pixels clip; None: 1.0 for a picture in [0,1].
+               saturation: value at which pixels clip; None: 1.0 if that is the highest, or else the highest value, if a
+               patch has it in more of its pixels than other patches have their own highest values.
     Returns:   `ChartPatches`, (24, C), row by row.
     Raises:    TypeError, ValueError for another shape, NaN; corners outside, crossing or not convex; patches too small,
                saturated or uneven, by name; a chart upside down or mirrored.
@@ -144,9 +147,10 @@ def chart_patches(
         raise ValueError("a picture of one channel is a mosaic: give its pattern, such as pattern='RGGB'.")
     names = spectral.colour_chart()[0]
     index, inside = _grid_cells(_checked_corners(corners, height, width), height, width)
-    if saturation is None:
-        saturation = 1.0 if float(planes.max()) <= 1 else math.inf
-    means, errors, full, uneven = [], [], [], []
+    highest = float(planes.max())
+    if saturation is None and highest == 1:
+        saturation = 1.0
+    means, errors, full, uneven, piled, at_top = [], [], [], [], [], []
     for patch in range(ROWS * COLUMNS):
         chosen = recorded & inside & (index == patch)
         counts = chosen.sum((1, 2))
@@ -160,7 +164,13 @@ def chart_patches(
         spread = torch.stack([v.std() for v in values])
         errors.append(spread / counts.sqrt())
         uneven.append(spread)
-        full.append(max(float((v >= saturation).double().mean()) for v in values) > _SATURATED)
+        full.append(max(float((v >= (saturation or math.inf)).double().mean()) for v in values) > _SATURATED)
+        at_top.append([float((v >= highest * (1 - _LEVEL)).double().mean()) for v in values])
+        piled.append([float((v >= v.max() - _LEVEL * highest).double().mean()) for v in values])
+    if saturation is None:  # black was taken off: more pixels at the end of the converter than other patches' have
+        usual = torch.tensor(piled).median(0).values
+        full = (torch.tensor(at_top) > 3 * usual + _SATURATED).any(1).tolist()
+        saturation = highest
     if any(full):
         clipped = ", ".join(name for name, is_full in zip(names, full, strict=True) if is_full)
         raise ValueError(f"saturated patches: {clipped}, at {saturation:g} and above. Expose white at 0.8 or less.")
@@ -251,7 +261,8 @@ def colour_matrix(raw_patches: Tensor | ChartPatches, *, illuminant: str | Tenso
                `chart_patches` gives.
                illuminant: of the chart, a name as of `spectral.illuminant`, or its power at 380, 390, .. 730 nm, (36,).
     Returns:   a `ColourFit`, float64.
-    Raises:    TypeError, ValueError for another shape, NaN, negative means, or patches in another order.
+    Raises:    TypeError, ValueError for another shape, NaN, negative means, or patches in another order. Warns where
+               red and blue are swapped.
     Source:    Sharma, Wu, Dalal, Color Res. Appl. 30 (2005) 21 (CIEDE2000).
 
     Example:
@@ -269,6 +280,12 @@ def colour_matrix(raw_patches: Tensor | ChartPatches, *, illuminant: str | Tenso
     signals = raw / white
     colours = reflectances @ spectral.xyz_weights(wavelengths, "D65") @ spectral.xyz_to_srgb_matrix().T
     matrix = _refined(signals, colours)
+    if bool(matrix[0, 2] > matrix[0, 0]) and bool(matrix[2, 0] > matrix[2, 2]):
+        warnings.warn(
+            "red comes mostly from the third channel and blue from the first: they are swapped, or the pattern is off "
+            "by a row and a column, such as RGGB for BGGR. Flats cannot tell that; the matrix makes up for it here.",
+            stacklevel=2,
+        )
     squares = torch.arange(len(signals)) % _FOLDS
     unseen = []
     for fold in range(_FOLDS):

@@ -220,11 +220,6 @@ def pairs(
     >>> [(a.name, b.name) for a, b in made], times
     ([('1_5ms.npy', '2_5ms.npy'), ('1_10ms.npy', '2_10ms.npy')], [0.005, 0.01])
     """
-    if len(paths) % 2:
-        raise ValueError(
-            f"{len(paths)} {what} are no pairs: expected two frames of each exposure. Does {paths[-1].name} or another "
-            "lack its twin?"
-        )
     if times is None:
         told = {path: exposure_time(path) for path in paths}
         known = {path: time for path, time in told.items() if time is not None}
@@ -237,6 +232,14 @@ def pairs(
                 f"the table of times has no line for {missing[0]} (of {len(missing)}): add {missing[0]},0.01."
             )
         known = {path: times[path.name] for path in paths}
+    if len(paths) % 2:
+        alike: dict[str, list[str]] = {}
+        for path in paths:
+            alike.setdefault(f"{known[path]:.6g} s" if known else "", []).append(path.name)
+        time, names = next((time, names) for time, names in alike.items() if len(names) % 2)
+        which = f"of {time} there is {len(names)}: {', '.join(names)}" if time else f"does {names[-1]} or another"
+        end = ". Add its twin, or leave it out." if time else " lack its twin?"
+        raise ValueError(f"{len(paths)} {what} are no pairs: expected two frames of each exposure; {which}{end}")
     ordered = sorted(paths, key=lambda path: (known.get(path, 0.0), natural(path)))
     made = list(zip(ordered[::2], ordered[1::2], strict=True))
     for one, two in made:

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from kcam import files
 from kcam.calibration.frames import as_frame
@@ -51,6 +52,10 @@ _CUT = 0.005
 """Of the dark pixels: where more are 0, the standard asks for a higher black level."""
 _ALIKE = 0.02
 """Relative: the signals of two frames of a pair differ by less."""
+_NOT_NORMAL, _SKEWED = 0.02, 0.04
+"""How far noise may be off the normal one: in its variance, relative; by its skewness, in a mean rounded [DN]."""
+_GRAY = 0.01
+"""Relative: colour filters whose four cells see light so alike are none."""
 
 
 @dataclass(frozen=True)
@@ -418,8 +423,11 @@ class _Frames:
                 )
             for index, time in enumerate(seconds):
                 if not (math.isfinite(time) and (time > 0 or (time == 0 and what == "darks"))):
+                    frame = self.levels[index][0]
+                    name = str(frame) if isinstance(frame, (str, os.PathLike)) else f"{what}[{index}]"
+                    fix = " A frame of no exposure is a dark: give it to --darks." if time == 0 else ""
                     raise ValueError(
-                        f"{what}[{index}] has an exposure time of {time:g} s: expected seconds > 0, such as 0.01."
+                        f"{name} has an exposure time of {time:g} s: expected seconds > 0, such as 0.01.{fix}"
                     )
             self.times = list(seconds)
 
@@ -498,6 +506,12 @@ def _check_bits(bits: int | None, highest: float, piled: float, steps: int, note
             f"all values are multiples of {steps}: {16 - round(math.log2(steps))}-bit numbers shifted up, or scaled. "
             f"Divide the frames by {steps}."
         )
+    if highest <= 255 and (bits is None or (piled > 0.01 and highest == 255)):
+        dim = "" if bits else " If the frames are only that dim, say bits, such as 12, or take brighter flats."
+        raise ValueError(
+            f"the highest value of all frames is {highest:g} DN: 8-bit numbers, whatever the files hold, and what is "
+            f"left of a noise there is rounding. Save the raw with all its bits.{dim}"
+        )
     exact = math.log2(highest + 1)
     if piled > 0.01 and exact.is_integer() and exact >= 9:
         if bits is not None and int(exact) < bits:
@@ -517,8 +531,11 @@ def _check_bits(bits: int | None, highest: float, piled: float, steps: int, note
     return bits
 
 
-def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> None:
-    """ValueError where the light of the four cells of 2 x 2 pixels is that of another colour filter."""
+def _check_phase(means: dict[tuple[int, int], float], pattern: str | None, notes: list[str]) -> None:
+    """ValueError where the light of the four cells of 2 x 2 pixels is that of another colour filter.
+
+    Off by a row and a column greens stay greens, and flats cannot tell red from blue: a chart can, `colour_matrix`.
+    """
     pattern_cells = {cell: means[cell] for cell in ((0, 0), (0, 1), (1, 0), (1, 1))}
     size = max(pattern_cells.values())
 
@@ -535,6 +552,12 @@ def _check_phase(means: dict[tuple[int, int], float], pattern: str | None) -> No
                 f"Say its pattern, such as {green}."
             )
         return
+    apart = max(unlike((0, 0), cell) for cell in pattern_cells)
+    if apart < _GRAY:
+        notes.append(
+            f"the four cells of {pattern} see the same light within {100 * apart:.2g} %: is this a monochrome sensor? "
+            "Then leave the pattern out"
+        )
     greens, others = (crossed, straight) if pattern in ("RGGB", "BGGR") else (straight, crossed)
     if greens > 0.05 and others < greens / 3:
         row, column = {
@@ -575,7 +598,8 @@ def photon_transfer(
                one light, dark current those of darks.
     Returns:   a value and its standard error for each of `UNITS`, by channel.
     Raises:    ValueError for no darks, one frame, sizes that differ, NaN, values that are not raw, the wrong number of
-               bits, a pattern that is off by one pixel, exposures of 0, flats that are all saturated or all dark.
+               bits, 8 bits, a pattern that is off by a row or by a column (by both, red is taken for blue: flats
+               cannot tell, `colour_matrix` warns), exposures of 0, flats that are all saturated or all dark.
     Valid when the light is even up to a polynomial of 4th order in x and y, which is taken off with what PRNU is as
     smooth, and the response is linear up to 70 % of saturation.
     Source:    EMVA 1288 release 4.0 Linear: temporal noise and gain, nonuniformity, linearity.
@@ -598,7 +622,7 @@ def photon_transfer(
     bits = _check_bits(bits, survey.highest, survey.piled, survey.steps or 1, notes)
     lit = max(survey.light.values()) > 0.05 * (survey.highest - survey.black)
     if lit and (pattern is None or len(PATTERNS[pattern]) == 2):
-        _check_phase(survey.light, pattern)
+        _check_phase(survey.light, pattern, notes)
     transfers = {name: _Transfer(name, *survey.levels(name, float(2**bits - 1))) for name in survey.cells}
     patterns: dict[str, list[_Sums]] = {name: [] for name in transfers}
     for index in range(len(flat_frames.levels)):  # once more through those that show the pattern of the gain
@@ -730,7 +754,7 @@ class _Transfer:
 
     def _black(self) -> tuple[float, float, float, float]:
         """Mean without light at no time [DN], and the dark signal [DN / s], each with its error: NaN if unknown."""
-        means, errors = (np.array([f(d) for d in self.darks]) for f in (lambda d: d.mean, _mean_error))
+        means, errors = np.array([_mean(level) for level in self.darks]).T
         times = [level.time for level in self.darks]
         if None not in times and len(set(times)) > 1:
             solved, covariance = _weighted(np.array(times, float), means, errors**2)
@@ -1029,12 +1053,41 @@ def _weighted(x: np.ndarray, y: np.ndarray, variance: np.ndarray) -> tuple[np.nd
     return solved, covariance * max(1.0, excess)
 
 
+def _mean(level: Level) -> tuple[float, float]:
+    """A level's mean before rounding and its standard error [DN].
+
+    Rounding draws the mean of noise below a step to the nearest number. Which place between two numbers has the mean
+    that was seen is told by sigma: those count by how well a normal noise of theirs has the variance that was seen.
+    """
+    drawn = math.sqrt((unrounded(level.variance) + 1 / 12) / (level.frames * level.pixels))
+    total = level.spread + level.variance * (1 - 1 / level.frames)  # of single frames, over the pixels
+    if total > 0.8:  # rounding moves it by less than 1e-6
+        return level.mean, drawn
+    step, numbers = math.floor(level.mean), np.arange(-5, 7)
+    place, sigma = np.linspace(-0.5, 1.5, 201), np.geomspace(0.02, 0.9, 60)
+    share = np.diff(ndtr((numbers + 0.5 - place[:, None]) / sigma[:, None, None]), prepend=0.0)
+    means = share @ numbers
+    variances = share @ numbers**2 - means**2
+
+    def before(mean: float) -> np.ndarray:
+        """For each sigma; in the middle of the places that are all rounded to one number."""
+        return np.array([np.interp(mean - step, row + 1e-6 * place, place) for row in means])
+
+    found = before(level.mean)
+    expected = np.array([np.interp(at, place, row) for at, row in zip(found, variances, strict=True)])
+    missed = (total - expected) / (total * (_NOT_NORMAL + math.sqrt(2 / level.pixels)) + 1e-9)
+    weight = np.exp((np.square(missed).min() - missed**2) / 2)
+    weight /= weight.sum()
+    middle = float(weight @ found)
+    open_ = math.sqrt(float(weight @ (found - middle) ** 2))
+    drawn = float(weight @ (before(level.mean + drawn) - before(level.mean - drawn))) / 2
+    skewed = _SKEWED * float(weight @ np.exp(-2 * math.pi**2 * sigma**2))
+    return step + middle, math.hypot(drawn, open_, skewed)
+
+
 def _mean_error(level: Level) -> float:
     """Standard error of a level's mean, by its noise and its rounding [DN]."""
-    temporal = unrounded(level.variance)
-    uneven = max(level.spread - temporal / level.frames, 0.0)
-    hidden = math.exp(-2 * math.pi**2 * max(temporal + uneven, 0.0)) / math.sqrt(12)
-    return math.hypot(math.sqrt((temporal + 1 / 12) / (level.frames * level.pixels)), hidden)
+    return _mean(level)[1]
 
 
 def _shown(maps: Sequence[np.ndarray]) -> np.ndarray:

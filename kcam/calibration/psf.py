@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import scipy
 import torch
 from torch import Tensor, nn
@@ -32,6 +33,7 @@ _WIDE = 25.0  # scales: the prior, far beyond what a linear fit can say; it hold
 _UNSEEN = 5.0  # scales: a value known no better than this is not seen
 _INFLATED = 3e3  # times the variance that it would have if all else were known: it is another value's twin
 _CLOSE = 1.0  # scales: the prior of what is not seen, once that is known
+_FARTHEST = 10.0  # scales of a step: what a picture does not tell leads to lenses of a hundred waves, slow to compute
 _STARTS, _STEPS, _MENDED = 8, 40, 4
 _SCAN = (1.0, 50.0)  # scales, on either side: what a scan looks at
 _FEW = 3  # values, which are scanned closely: blurs of defocus agree within a tenth of it only
@@ -39,6 +41,9 @@ _QUIET = 3e-5  # of the peak: the least noise that is estimated; PSFs are no bet
 _ELSEWHERE = 0.3  # scales: an end of a start that is another one
 _APART = 3.0  # standard errors between two fits: a value that is ambiguous
 _SAME_FIT = 9.0  # of chi^2: three standard deviations, below which two fits are equally good
+_MISFIT = 3.0  # of chi^2 per degree of freedom: a model or a noise that is wrong
+_LEVEL, _NEARLY = 1e-6, 1e-3  # relative: values at one converter's end; noise is more
+_PLATEAU = 3  # pixels that touch: two photon counts may be the same
 _NAMES = {
     1: "piston", 2: "tilt x", 3: "tilt y", 4: "defocus", 5: "astigmatism 45", 6: "astigmatism 0", 7: "coma y",
     8: "coma x", 9: "trefoil y", 10: "trefoil x", 11: "spherical",
@@ -55,6 +60,8 @@ class PSFFit:
     unobservable: name -> why the picture does not tell it. Its error is inf, its value that of the fit nearest to the
         lens that was given, so that `lens` still makes the picture.
     chi_squared: per degree of freedom; 1 where model and noise are right (and, of an estimated noise, always near).
+        Where it is above 1 by more than chance, standard errors are widened by its root, and the covariance by itself;
+        a wrong model may move values by more than that.
     places: (S, 3) of each target: picture, x, y [pixels]; of an edge picture, angle of the normal [rad], distance from
         the picture's middle [pixels].
 
@@ -131,15 +138,17 @@ def fit_psf(
         target: "points", "edge", or "auto" to tell by the picture.
         points: (K, 2) x and y about where points are [pixels]; None to find them.
         full_well: electrons that the value 1.0 stands for (1.0 for a picture in electrons): then the noise is known,
-            with read_noise [electrons]. None: shot and read noise are estimated from what the fit leaves, no less than
-            3e-5 of the peak, which is what PSFs are good to.
+            with read_noise [electrons], and chi^2 tells whether the model is right: above 3 per degree of freedom, as
+            of a wrong pixel_pitch, a UserWarning says so. None: shot and read noise are estimated from what the fit
+            leaves, no less than 3e-5 of the peak, which is what PSFs are good to.
         fill_factor: light-sensitive share of a pixel.
         upright: the picture is as a camera shows it, turned by 180 degrees against the light on the sensor; False for
             light as it falls, as `Lens.psf` gives it.
     Returns:   a `PSFFit`.
     Raises:    TypeError, ValueError for a picture that is no float tensor of these shapes, has NaN, is saturated (of
-               pixels at 1.0 in a picture in [0,1]), shows no target, or too small; an edge slanted by less than 1.5
-               degrees; a lens in which nothing trains, or more than 64 numbers; lengths that are not in metres.
+               pixels at 1.0 in a picture in [0,1], or of three or more that touch at its highest value), shows no
+               target, or too small; an edge slanted by less than 1.5 degrees; a lens in which nothing trains, or more
+               than 64 numbers; lengths that are not in metres.
     Valid for isoplanatic pictures of a `Lens`; a `CompoundLens` has the PSF of each point's place, if the middle of the
         picture is its axis. Standard errors are linear: of half a wave and more, trust several pictures rather.
     Source:    Gonsalves, Phase retrieval and diversity in adaptive optics, Opt. Eng. 21 (1982) 829 (two focuses, the
@@ -173,7 +182,7 @@ def fit_psf(
     for step in steps.tolist():
         check_length(abs(step), name="defocus", within=(0.0, 0.05), example="50 * um")
     found = find_targets(pictures, kind=target, points=points)
-    _check_saturation(found)
+    _check_saturation(found, pictures)
     shape = (pictures.shape[2], pictures.shape[3])
     width = math.sqrt(fill_factor)
     conditions = Conditions(shape, pitch, width, bands, shares, away.tolist(), steps.tolist(), upright)
@@ -182,7 +191,16 @@ def fit_psf(
     with torch.enable_grad(), warnings.catch_warnings():
         problem.trained.bank(problem.trained.start)  # may warn of the lens that was given; not of what the search tries
         warnings.filterwarnings("ignore", message=r"f/\S+ is outside", category=UserWarning)
-        return _Fit(problem, noise).result(lens)
+        fit = _Fit(problem, noise).result(lens)
+    if fit.chi_squared > _MISFIT:
+        warnings.warn(
+            f"chi^2 per degree of freedom is {fit.chi_squared:.3g}, expected 1: no such lens makes this picture with "
+            f"this noise. Standard errors are {math.sqrt(fit.chi_squared):.2g} times as wide as the noise has them; "
+            "values may be off by more. Check pixel_pitch, the f-number, wavelengths, full_well, read_noise, and that "
+            "no pixel is saturated.",
+            stacklevel=2,
+        )
+    return fit
 
 
 # ---- what goes in ----------------------------------------------------------------------------------------------------
@@ -222,14 +240,36 @@ def _each(value: Any, count: int, *, name: str) -> Tensor:
     return values.reshape(-1).expand(count).clone()
 
 
-def _check_saturation(found: Targets) -> None:
+def _check_saturation(found: Targets, pictures: Tensor) -> None:
+    """ValueError where a target has pixels at 1.0, or a plateau at the highest value, as of black taken off after it.
+
+    Light has no plateau but in pictures without noise: there the pixels around it are alike too, or as bright within
+    a step or two of the converter.
+    """
     for index, values in enumerate(found.values):
-        full = (values >= 1.0) & found.used[index]
-        if float(values.max()) == 1.0 and int(full.sum()) > 1:
+        used = found.used[index]
+        picture = pictures[int(found.picture[index]), 0].numpy()
+        top = float(picture.max())
+        x, y = (found.origin[index] + torch.stack([found.x[index], found.y[index]], -1)[used]).round().long().T.numpy()
+        labels, _ = scipy.ndimage.label(picture >= top * (1 - _LEVEL), np.ones((3, 3)))
+        most = 0
+        for label in set(labels[y, x].tolist()) - {0} if top > 0 else ():
+            plateau = labels == label
+            around = picture[scipy.ndimage.binary_dilation(plateau, np.ones((3, 3))) & ~plateau]
+            levels = np.unique((around / (top * _LEVEL)).round()) * top * _LEVEL
+            unlike = len(levels) > 4  # more than of a PSF in the middle of four pixels
+            if (
+                plateau.sum() >= _PLATEAU
+                and unlike
+                and top - around.mean() > max(_NEARLY * top, 2 * np.diff(levels).min())
+            ):
+                most = max(most, int(plateau.sum()))
+        full = int(((values >= 1.0) & used).sum())
+        if most or (float(values.max()) == 1.0 and full > 1):
             x, y = found.origin[index].tolist()
             raise ValueError(
-                f"{int(full.sum())} pixels of the target near x = {x:.0f}, y = {y:.0f} are at 1.0: saturated, so that "
-                "the shape of its peak is lost. Expose at most 0.8 of the full well."
+                f"{most or full} pixels of the target near x = {x:.0f}, y = {y:.0f} are at {top:.4g}: saturated, so "
+                "that the shape of its peak is lost. Expose at most 0.8 of the full well."
             )
 
 
@@ -340,9 +380,12 @@ class _Fit:
             best = better
         equations, _ = self._normal(best)
         covariance, inflation = self._covariance(equations)
-        errors = covariance.diagonal().sqrt()
-        unseen = self._unseen(errors, inflation)
+        unseen = self._unseen(covariance.diagonal().sqrt(), inflation)
         names = trained.names
+        freedom = max(1, int(targets.used.sum()) - (len(names) - len(unseen)) - 4 * len(targets.values))
+        excess = best.cost / freedom
+        covariance = covariance * (excess if excess > 1 + 3 * math.sqrt(2 / freedom) else 1.0)
+        errors = covariance.diagonal().sqrt()
         rival, ambiguous = self._rival(
             best, rivals, {n: e for n, e in zip(names, errors, strict=True) if n not in unseen}
         )
@@ -351,7 +394,6 @@ class _Fit:
             best = self._descend(best)
         fitted = copy.deepcopy(lens)
         put_values(fitted, best.values)
-        freedom = int(targets.used.sum()) - (len(names) - len(unseen)) - 4 * len(targets.values)
         places = best.places if targets.kind == "edge" else best.places + targets.origin
         return PSFFit(
             fitted,
@@ -361,7 +403,7 @@ class _Fit:
             ambiguous,
             dict(zip(names, rival.values.tolist(), strict=True)) if ambiguous else None,
             unseen,
-            best.cost / max(freedom, 1),
+            best.cost / freedom,
             torch.cat([targets.picture[:, None].double(), places], dim=1),
         )
 
@@ -455,6 +497,9 @@ class _Fit:
             equations, seen = self._normal(state, seen)
             while damping < 1e8:
                 step, own_step = equations.solved(damping)
+                if bool((step / self.scales[self.free]).abs().max() > _FARTHEST):
+                    damping *= 8
+                    continue
                 values = state.values.index_add(0, self.free, step)
                 places = state.places + own_step[:, :2].clamp(-2, 2)
                 cost = self._cost(values, places)
@@ -581,7 +626,7 @@ class _Fit:
             apart = dict(zip(self.problem.trained.names, (state.values - best.values).abs(), strict=True))
             return tuple(name for name, error in errors.items() if bool(apart[name] > _APART * error))
 
-        equal = [state for state in rivals if state.cost < best.cost + _SAME_FIT]
+        equal = [state for state in rivals if state.cost < best.cost + self._close(best.cost)]
         rival = max(equal, key=lambda state: len(others(state)), default=best)
         return rival, others(rival)
 

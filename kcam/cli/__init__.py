@@ -358,7 +358,7 @@ def calibrate() -> None:
         typer.echo(path)
 
 
-app.command("calibrate-sensor")(calibrate_sensor)
+app.command("calibrate-sensor", context_settings={"allow_extra_args": True})(calibrate_sensor)
 
 
 @app.command()

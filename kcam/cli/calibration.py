@@ -11,6 +11,7 @@ from kcam.cli.console import one_line_errors, progress
 
 
 def calibrate_sensor(
+    context: typer.Context,
     darks: Annotated[
         list[str] | None, typer.Option("--darks", help='frames without light, in pairs: a file, or "d*.tif"; repeat it')
     ] = None,
@@ -35,9 +36,14 @@ def calibrate_sensor(
     Frames are .tif, .png or .npy of 16 bits, two of each exposure; in order of their times, where known, and names.
     """
     with one_line_errors():
-        from kcam import calibration, plots
+        from kcam import calibration, files, plots
         from kcam.calibration import find
 
+        if context.args:  # a shell put a pattern's files in its place; whose they are is lost
+            raise ValueError(
+                f"got {len(context.args)} names that follow no option, such as {context.args[0]}: the shell "
+                'put the files of a pattern in its place. Put patterns in quotes: --darks "d*.tif" --flats "f*.tif".'
+            )
         for option, given in (("--darks", darks), ("--flats", flats)):
             if not given:
                 raise ValueError(
@@ -45,6 +51,7 @@ def calibrate_sensor(
                 )
         if out.suffix.lower() != ".json":
             raise ValueError(f"cannot write {out.name}: its name must end in .json.")
+        files.check_place(out)
         page = out.with_suffix(".html")
         plots.check_writable(page, suffixes=(".html",))
         table = None if times is None else calibration.read_times(times)

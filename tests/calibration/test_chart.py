@@ -174,6 +174,30 @@ def test_a_mosaic_gives_each_channel_from_its_own_pixels(pattern: str) -> None:
     assert found.values.numpy() == pytest.approx(raw, abs=2e-3)
 
 
+def test_black_taken_off_a_saturated_chart_leaves_patches_that_are_seen() -> None:
+    raw, draws = camera_raw(0, "D65")[0], np.random.default_rng(0)
+    black = 64 / 4095
+    for exposure, clipped in ((0.9, False), (1.15, True), (2.0, True)):  # white reflects 0.9
+        clean = exposure / 0.8 * drawn(raw)
+        noisy = clean + draws.normal(0, 1, clean.shape) * np.sqrt(1e-6 + clean.clip(0) / 10_000)
+        picture = torch.from_numpy(((noisy + black).clip(0, 1) * 4095).round() / 4095 - black)
+        for given in (picture, picture.float(), 4095 * picture):
+            if clipped:
+                with pytest.raises(ValueError, match="saturated patches: .*white.*, at .* and above"):
+                    chart_patches(given, corners=CORNERS)
+            else:
+                chart_patches(given, corners=CORNERS)
+
+
+@pytest.mark.parametrize("illuminant", ["D65", "A"])
+@pytest.mark.parametrize("seed", range(3))
+def test_red_taken_for_blue_warns(seed: int, illuminant: str) -> None:
+    raw = torch.from_numpy(camera_raw(seed, illuminant)[0])
+    colour_matrix(raw, illuminant=illuminant)
+    with pytest.warns(UserWarning, match="they are swapped, or the pattern is off by a row and a column"):
+        colour_matrix(raw.flip(1), illuminant=illuminant)
+
+
 RAW = camera_raw(0, "D65")[0]
 
 

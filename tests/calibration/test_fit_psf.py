@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from torch import nn
 
 from kcam import Camera, Scene, optics
 from kcam.calibration import PSFFit, fit_psf
+from kcam.calibration.psf import _check_saturation
+from kcam.calibration.targets import find_targets
 from kcam.optics.compound.tracing import trace
 from kcam.units import mm, nm, um
 
@@ -363,6 +366,89 @@ def test_what_cannot_be_fitted_says_why(picture: torch.Tensor, more: dict[str, o
     arguments = {"lens": lens(8), "pixel_pitch": PITCH} | more
     with pytest.raises((TypeError, ValueError), match=text):
         fit_psf(picture, **arguments)  # type: ignore[arg-type]
+
+
+def test_black_taken_off_a_saturated_picture_leaves_a_plateau_that_is_seen() -> None:
+    seen = points({4: 30 * nm}, seed=3, count=1)
+    black = 64 / 4095
+    raw = ((seen / seen.max() * 3 + black).clamp(0, 1) * 4095).round() / 4095 - black
+    for picture in (raw, raw.float(), (raw * 4095).round()):
+        with pytest.raises(ValueError, match=r"\d pixels of the target near x = 18, .* saturated, so that the shape"):
+            found(picture)
+    bright = edge({4: 30 * nm}, angle=5, seed=1)
+    with pytest.raises(ValueError, match="saturated"):
+        found(bright.clamp(max=9800.0))
+
+
+def test_two_photon_counts_that_are_the_same_are_no_plateau() -> None:
+    draws = np.random.default_rng(0)
+    for _ in range(10):
+        coefficients = {j: float(draws.normal(0, 25 * nm)) for j in range(4, 9)}
+        share = independent.pixel_psf(
+            coefficients, wavelength=WAVELENGTH, f_number=20.0, pitch=PITCH, window=31,
+            moved=tuple(draws.uniform(-0.5, 0.5, 2)),
+        )  # fmt: skip
+        for _ in range(20):
+            electrons = math.exp(draws.uniform(math.log(300), math.log(1e5)))
+            picture = torch.from_numpy(draws.poisson(electrons * share + 2.0).astype(float))[None, None]
+            _check_saturation(find_targets(picture, kind="points", points=None), picture)
+
+
+def test_four_pixels_around_a_point_of_no_noise_are_no_plateau() -> None:
+    share = independent.pixel_psf({}, wavelength=WAVELENGTH, f_number=20.0, pitch=PITCH, window=31, moved=(0.5, 0.5))
+    assert (share > 0.999999 * share.max()).sum() == 4
+    for dtype in (torch.float32, torch.float64):
+        picture = torch.from_numpy(share).to(dtype).double()[None, None]
+        _check_saturation(find_targets(picture, kind="points", points=None), picture)
+
+
+def test_a_wide_peak_in_few_steps_is_no_plateau() -> None:
+    blurred = {4: 200 * nm}
+    share = independent.pixel_psf(blurred, wavelength=WAVELENGTH, f_number=20.0, pitch=PITCH / 2, window=61)
+    for top in (20, 50, 100, 250):
+        picture = torch.from_numpy((share / share.max() * top).round())[None, None]
+        _check_saturation(find_targets(picture, kind="points", points=None), picture)
+
+
+def focused() -> optics.Lens:
+    """Whose diameter trains."""
+    diameter = nn.Parameter(torch.tensor(2.45 * mm, dtype=torch.float64))
+    return optics.Lens(optics.CircularAperture(diameter), optics.ThinLens(50 * mm), sensor_distance=50.3 * mm)
+
+
+def test_errors_are_widened_and_a_warning_given_where_the_noise_is_more_than_was_said() -> None:
+    picture = points({}, seed=9, count=1, defocus=0.3 * mm)
+    right = found(picture, focused(), distances=math.inf, read_noise=READ_NOISE)
+    assert right.chi_squared < 1.1
+    with pytest.warns(UserWarning, match=r"chi\^2 per degree of freedom is .* expected 1: .* Check pixel_pitch"):
+        wrong = found(picture, focused(), distances=math.inf, full_well=10.0, read_noise=10 * READ_NOISE / 10**0.5)
+    assert wrong.chi_squared == pytest.approx(10 * right.chi_squared, rel=0.02)
+    (name,) = right.values
+    assert wrong.standard_errors[name] == pytest.approx(right.standard_errors[name], rel=0.1)
+    assert float(wrong.covariance.sqrt()) == pytest.approx(wrong.standard_errors[name])
+
+
+def test_a_wrong_pixel_pitch_warns() -> None:
+    picture = points({}, seed=9, count=1, defocus=0.3 * mm)
+    with pytest.warns(UserWarning, match="no such lens makes this picture"):
+        fit_psf(
+            picture, lens=focused(), pixel_pitch=0.7 * PITCH, upright=False, wavelengths=[WAVELENGTH], full_well=1.0,
+            read_noise=READ_NOISE, distances=math.inf,
+        )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sharp", [False, True])
+def test_an_edge_of_eight_terms_takes_seconds_also_where_no_lens_makes_it(sharp: bool) -> None:
+    """What an edge does not tell must not lead to lenses of a hundred waves, whose PSFs take seconds each."""
+    picture = edge({4: 60 * nm, 5: -20 * nm, 6: 15 * nm, 8: 30 * nm}, angle=5, seed=1)
+    began = time.process_time()
+    if sharp:  # than any lens makes it
+        with pytest.warns(UserWarning, match="per degree of freedom"):
+            found((picture - 5050).sign() * (4950 + 0.05 * (picture - 5050).abs().sqrt()) + 5050)
+    else:
+        assert 0.8 < found(picture).chi_squared < 1.2
+    assert time.process_time() - began < 60
 
 
 def test_a_lens_in_which_nothing_trains_is_refused() -> None:

@@ -83,6 +83,27 @@ def test_noise_below_a_step_is_recovered_or_said_to_be_hidden() -> None:
     assert np.mean(seen) > 0.94
 
 
+@pytest.mark.parametrize(
+    ("gain", "noise", "dsnu", "current"),
+    [((0.04, 0.12), (1.5, 3.5), (0.0, 2.5), (5, 25)), ((0.048, 0.052), (3.1, 3.3), (1.9, 2.1), (14.5, 15.5))],
+)
+def test_dark_current_of_noise_below_a_step_is_within_its_errors(
+    gain: tuple[float, float], noise: tuple[float, float], dsnu: tuple[float, float], current: tuple[float, float]
+) -> None:
+    """In a wide class, and in a narrow one, whose short darks all lie at one place between two numbers."""
+    off = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        frames = draw(
+            seed, gain=rng.uniform(*gain), read_noise=rng.uniform(*noise), dsnu=rng.uniform(*dsnu), bits=12, black=64,
+            dark_current=rng.uniform(*current), dark_times=[0.01, 1.0, 5.0], well=1.0, prnu=0.005, size=96, levels=5,
+        )  # fmt: skip
+        found_ = found(frames).channels["mono"].dark_current
+        off.append((found_.value - frames.truth["dark_current"]) / found_.standard_error)
+    assert abs(np.mean(off)) < 0.6
+    assert np.sqrt(np.mean(np.square(off))) < 1.2
+
+
 def test_standard_errors_shrink_with_the_pixels() -> None:
     small, large = (
         found(draw(3, size=size, levels=12, gain=0.5, read_noise=5.0, dsnu=4.0, prnu=0.01)).channels["mono"]
@@ -253,6 +274,11 @@ def spoilt(flats: np.ndarray, value: float) -> np.ndarray:
         ({"flats": GOOD.flats / np.float32(4095)}, r"shares of full scale: use \(frame \* \(2\*\*bits - 1\)\).round"),
         ({"flats": GOOD.flats[..., :48]}, "has 64 x 48 pixels, the frames before it 64 x 64: expected one size"),
         ({"flats": GOOD.flats.astype(np.uint8)}, "has 8 bits"),
+        ({"flats": GOOD.flats >> 4, "darks": GOOD.darks >> 4}, "8-bit numbers, whatever the files hold"),
+        (
+            {"flats": GOOD.flats >> 4, "darks": GOOD.darks >> 4, "bits": None},
+            "the highest value of all frames is 255 DN: 8-bit numbers, .* with all its bits. If the frames are",
+        ),
         ({"flats": GOOD.flats * 16, "darks": GOOD.darks * 16}, "all values are multiples of 16: 12-bit numbers"),
         ({"bits": 10}, "the highest value is 4095 DN, above 1023, full scale of 10 bits|saturated pixels"),
         ({"bits": 14}, "saturated pixels stand at 4095 DN, full scale of 12 bits, but bits is 14. Use bits=12"),
@@ -271,10 +297,28 @@ def test_hard_cases_end_in_clear_errors(change: dict[str, Any], text: str) -> No
         photon_transfer(arguments.pop("flats"), arguments.pop("darks"), **arguments)
 
 
+def test_frames_that_are_no_more_than_dim_are_taken_where_bits_say_so() -> None:
+    frames = draw(0, size=64, levels=5, bits=12, gain=0.1, well=2.0, read_noise=20.0, dsnu=1.0, brightest=0.03)
+    assert frames.flats.max() <= 255
+    gain = found(frames, bits=12).channels["mono"].gain
+    assert abs(gain.value - 0.1) < 3 * gain.standard_error
+    with pytest.raises(ValueError, match="8-bit numbers, .* If the frames are only that dim, say bits, such as 12"):
+        found(frames, bits=None)
+
+
+def test_a_pattern_on_a_monochrome_sensor_is_noted() -> None:
+    result = photon_transfer(GOOD.flats, GOOD.darks, bits=12, pattern="RGGB")
+    (note,) = result.notes
+    assert "the four cells of RGGB see the same light within" in note
+    assert "leave the pattern out" in note
+
+
 @pytest.mark.parametrize("true", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_a_colour_filter_off_by_one_pixel_is_named(true: str) -> None:
     frames = draw(8, pattern=true, size=64, levels=6)
-    assert list(found(frames, pattern=true).channels) == ["R", "G", "B"]
+    result = found(frames, pattern=true)
+    assert list(result.channels) == ["R", "G", "B"]
+    assert not result.notes
     other = "GRBG" if true in ("RGGB", "BGGR") else "RGGB"
     with pytest.raises(
         ValueError, match=f"the two greens of {other} differ by .*off by one pixel. Use pattern"
@@ -374,7 +418,12 @@ def test_what_the_command_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     )
     assert '--darks "x*.tif" matches no file' in fails("calibrate-sensor", "--darks", "x*.tif", "--flats", "f*.tif")
     assert "its name must end in .json" in fails("calibrate-sensor", *both, "--out", "sensor.txt")
-    assert "there is no folder nowhere" in fails("calibrate-sensor", *both, "--out", "nowhere/sensor.json")
+    assert "cannot write sensor.json: there is no folder nowhere" in fails(
+        "calibrate-sensor", *both, "--out", "nowhere/sensor.json"
+    )
+    shell = ("--darks", "d1.tif", "d2.tif", "d3.tif", "--flats", "f1.tif", "f2.tif")
+    assert "got 3 names that follow no option, such as d2.tif" in (said := fails("calibrate-sensor", *shell))
+    assert 'Put patterns in quotes: --darks "d*.tif"' in said
     assert "is among the darks and the flats" in fails("calibrate-sensor", "--darks", "d1.tif", "--flats", "d*.tif")
     assert "1 flats are no pairs" in fails("calibrate-sensor", "--darks", "d*.tif", "--flats", "f1.tif")
     Path("times.csv").write_text("f1.tif,0.01\nf2.tif,soon\n")
@@ -403,6 +452,24 @@ def test_pairs_of_files_are_sorted_by_time_and_number(tmp_path: Path) -> None:
     assert times == [0.003, 0.02]
     with pytest.raises(ValueError, match=r"f1_1ms.tif \(0.001 s\) and f2_2ms.tif \(0.002 s\) would be a pair"):
         calibration.pairs([Path("f1_1ms.tif"), Path("f2_2ms.tif")], what="flats")
+
+
+def test_an_exposure_without_its_twin_is_named() -> None:
+    names = [Path(f"f_{time}ms_{twin}.tif") for time in (5, 20, 40) for twin in "ab"]
+    lone = "5 flats are no pairs: .* of 0.02 s there is 1: f_20ms_a.tif. Add its twin, or leave it out"
+    with pytest.raises(ValueError, match=lone):
+        calibration.pairs([name for name in names if name.name != "f_20ms_b.tif"], what="flats")
+    with pytest.raises(ValueError, match="3 flats are no pairs: .* does f3.tif or another lack its twin?"):
+        calibration.pairs([Path(f"f{index}.tif") for index in (1, 2, 3)], what="flats")
+
+
+def test_a_flat_of_no_exposure_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    frames = draw(0, size=64, levels=4, bits=12)
+    write(Frames(frames.flats, frames.darks, [0.0, *frames.times[1:]], frames.dark_times, 12, {}), tmp_path)
+    said = fails("calibrate-sensor", "--darks", "d*.tif", "--flats", "f*.tif")
+    assert "f1_0.000000000s.tif has an exposure time of 0 s" in said
+    assert "A frame of no exposure is a dark: give it to --darks" in said
 
 
 # ---- the stages of a calibrated sensor ---------------------------------------------------------------------------
