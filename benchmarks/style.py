@@ -79,7 +79,10 @@ def thesis_camera(*, ordinary: bool = False, straight_through: bool = False) -> 
 
 @dataclass(frozen=True)
 class Arm:
-    """What is trained and how: camera, the loss's arguments, settings. note: for tables. whole: on all of a style."""
+    """What is trained and how: camera, the loss's arguments, settings. note: for tables. whole: on all of a style.
+
+    pieces: whether the trained camera paints with pieces of what it was trained on.
+    """
 
     note: str
     camera: Callable[[], Camera]
@@ -87,9 +90,10 @@ class Arm:
     settings: Settings
     styles: tuple[str, ...] = field(default=tuple(STYLES))
     whole: bool = False
+    pieces: bool = False
 
 
-OURS = ("optics", "filter", "convolution", "stage")
+OURS = ("optics", "filter", "convolution", "stage", "pieces")
 QUICK = PRESETS["quick"]
 RATES = QUICK.settings.rates
 CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS, content_aim=None)
@@ -115,8 +119,15 @@ ARMS: dict[str, Arm] = {
         QUICK.loss,
         only("optics", "filter", "demosaic", "tone"),
     ),
-    "stage": Arm("+ style stage: kcam train", style_camera, QUICK.loss, QUICK.settings),
-    "whole": Arm("kcam train, on all of the painting", style_camera, QUICK.loss, QUICK.settings, whole=True),
+    "stage": Arm("+ a network: kcam train --preset quick", style_camera, QUICK.loss, QUICK.settings),
+    "pieces": Arm(
+        "+ pieces of the painting: kcam train",
+        PRESETS["pieces"].camera,
+        PRESETS["pieces"].loss,
+        PRESETS["pieces"].settings,
+        pieces=True,
+    ),
+    "whole": Arm("the network, on all of the painting", style_camera, QUICK.loss, QUICK.settings, whole=True),
     "thesis": Arm("the thesis's arrangement", thesis_camera, THESIS_LOSS, THESIS),
     "thesis, our start": Arm(
         "ordinary start, non-negative filter", lambda: thesis_camera(ordinary=True), THESIS_LOSS, THESIS, ("strokes",)
@@ -191,6 +202,8 @@ def run(style: str, name: str, work: Path, *, seed: int = 0) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         trained = fit(camera, loss, settings=settings)
+    if arm.pieces:
+        camera = Camera(*camera, isp.TextureTransfer(shown), context=camera.context)
     seconds = time.perf_counter() - began
     pictures = shots(camera)
     folder = folder_of(style, name, work, seed=seed)
@@ -241,8 +254,12 @@ def folder_of(style: str, name: str, work: Path, *, seed: int = 0) -> Path:
 
 
 def collect(work: Path) -> None:
-    """Runs in the work folder to the committed results and pictures."""
-    rows = [json.loads(path.read_text()) for path in sorted(work.glob("*/result.json"))]
+    """Runs in the work folder to the committed results and pictures; what was not run again stays as it is."""
+    own = [json.loads(path.read_text()) for path in sorted(work.glob("*/result.json"))]
+    known = {(row["style"], row["arm"], row["seed"]): row for row in json.loads(RESULT.read_text())["rows"]}
+    rows = list((known | {(row["style"], row["arm"], row["seed"]): row for row in own}).values())
+    for row in rows:
+        row["note"] = ARMS[row["arm"]].note
     order = {name: index for index, name in enumerate(ARMS)}
     rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]], row["seed"]))
     write_json(RESULT, {"environment": environment(), "rows": rows})
@@ -253,18 +270,18 @@ def collect(work: Path) -> None:
     photographs = measures.photographs(SIZE)
     ordinary = shots(style_camera(stage=False))
     hopper = next(iter(photographs))
-    sheets = {
-        "style": plots.contact_sheet(
-            [[halves(style)[0][:, :SIZE], *(shot(style, "stage", name) for name in photographs)] for style in STYLES],
+    sheets: dict[str, Callable[[], Any]] = {
+        "style": lambda: plots.contact_sheet(
+            [[halves(style)[0][:, :SIZE], *(shot(style, "pieces", name) for name in photographs)] for style in STYLES],
             titles=["Style", *(f"A shot: {name}" for name in photographs)],
             labels=[f"kcam train {style}" for style in STYLES],
         ),
-        "style-parts": plots.contact_sheet(
+        "style-parts": lambda: plots.contact_sheet(
             [[ordinary[hopper], *(shot(style, part, hopper) for part in OURS)] for style in STYLES],
-            titles=["Ordinary camera", "DOE alone", "+ colour filter", "+ 3x3 and tone", "+ style stage"],
+            titles=["Ordinary camera", "DOE alone", "+ colour filter", "+ 3x3 and tone", "+ a network", "+ pieces"],
             labels=list(STYLES),
         ),
-        "style-thesis": plots.contact_sheet(
+        "style-thesis": lambda: plots.contact_sheet(
             [
                 [photographs[name], *(shot("strokes", arm, name) for arm in ARMS if arm.startswith("thesis"))]
                 for name in photographs
@@ -273,23 +290,30 @@ def collect(work: Path) -> None:
             labels=["The thesis's arrangement", "", ""],
         ),
     }
-    for name, figure in sheets.items():
+    for name, sheet in sheets.items():
+        try:
+            figure = sheet()
+        except FileNotFoundError as error:
+            print(f"{name} stays as it is: {error}")
+            continue
         save_jpeg(figure, ROOT / "docs" / "images" / f"{name}.jpg", **BULKY)
-    print(RESULT, *sheets)
+        print(name)
 
 
 def paint_pictures() -> None:
-    """What `kcam paint` makes: textures of the styles from white noise, and paintings from a photograph."""
+    """What `kcam paint` makes: textures from white noise, and a photograph painted by the loss and with pieces."""
     photograph = measures.photographs(SIZE)["hopper"]
     rows = []
     for style in STYLES:
         own, _ = halves(style)
         texture = paint(StyleLoss(own, content=0.0, colour=1.0), shape=(SIZE, SIZE), steps=PAINT_STEPS)
         painted = paint(StyleLoss(own, content=0.3, colour=1.0), photo=photograph, steps=PAINT_STEPS)
-        rows.append([own[:, :SIZE], texture, painted])
+        seeded = torch.Generator().manual_seed(SEED)
+        pieces = isp.texture_transfer(photograph[None], exemplar=own, generator=seeded)[0]
+        rows.append([own[:, :SIZE], texture, painted, pieces])
     sheet = plots.contact_sheet(
         rows,
-        titles=["Style", "Texture, from white noise", "Painting, from the photo"],
+        titles=["Style", "Texture, from white noise", "Painted by the loss", "Painted with pieces"],
         labels=list(STYLES),
     )
     save_jpeg(sheet, ROOT / "docs" / "images" / "painted.jpg", **BULKY)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 DEMOSAICING = (isp.Demosaic, isp.LearnedDemosaic)
 FINISHING = (isp.Denoise, isp.LocalToneMapping, isp.Sharpen, isp.JPEG)
+PAINTING = (isp.StyleStage, isp.TextureTransfer)
 DEVELOPING = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve, *FINISHING)
 """The first of these ends the raw signal."""
 ORDER: tuple[type[nn.Module] | tuple[type[nn.Module], ...], ...] = (
@@ -54,7 +55,7 @@ PLACES: tuple[tuple[Kinds, Kinds, Kinds], ...] = (
     ((sensor.Transmission,), (optics.Imaging,), (sensor.ColourFilter,)),
     ((sensor.Motion, optics.VeilingGlare), (optics.Imaging,), (sensor.Mosaic, *DEVELOPING)),
     (PIXELS, (optics.Imaging, sensor.ColourFilter), DEVELOPING),
-    (FINISHING, (optics.Imaging, sensor.ColourFilter, sensor.Mosaic, sensor.ADC, *DEMOSAICING), ()),
+    ((*FINISHING, *PAINTING), (optics.Imaging, sensor.ColourFilter, sensor.Mosaic, sensor.ADC, *DEMOSAICING), ()),
 )
 """(stages, those of a camera that they stand behind, those that they stand before); all others may stand anywhere."""
 _TAKES = {optics.Imaging: "a scene", sensor.ColourFilter: "bands", **dict.fromkeys(DEMOSAICING, "a mosaic")}

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from torch import Tensor
 
 from kcam import files, isp, optics, plots, sensor
-from kcam.camera import Camera
+from kcam.camera import PAINTING, Camera
 from kcam.optics.pupil.coordinates import Pupil
 from kcam.optics.source import Points
 from kcam.plots import INK, MUTED, SMALL, TITLE, Sheet
@@ -28,7 +28,6 @@ WIDTH, EDGE, GAP, HEAD = 12.4, 0.4, 0.12, 1.3  # inches
 PANEL, APART = 1.4, 0.42  # height of the panels below the pictures, and the space between two kinds of them
 PSF_WAVELENGTHS = (450 * nm, 550 * nm, 650 * nm)
 FILTER_COLOURS = ("#c8553d", "#2a9d5f", "#3f6fd8", MUTED)
-_PAINTING = (isp.StyleStage, isp.TextureTransfer)
 CSS_PIXELS_PER_INCH = (62, 96)  # of a figure: narrower than that it scrolls sideways, wider it does not grow
 
 
@@ -44,9 +43,9 @@ def style_sheet(
 ) -> Figure:
     """The contact sheet of a camera in training: the style, scenes and its pictures of them, and what it has learned.
 
-    The camera's picture before what paints (`StyleStage`, `TextureTransfer`) and the one after it stand in columns of their own; a camera
-    without one has one column. Below, as far as the camera has them: the phase of its DOE, PSFs at the first scene's
-    (median) distance, its filter, the weights of its convolution.
+    The camera's picture before what paints (`StyleStage`, `TextureTransfer`) and the one after it have a column each;
+    a camera without one has one column. Below, as far as the camera has them: the phase of its DOE, PSFs at the first
+    scene's (median) distance, its filter, the weights of its convolution.
 
     Args:      style: (3,H,W) sRGB; below the whole, parts of it are shown at the scale of the pictures.
                scenes: two to four, of a batch the first. step: for the title. start: the camera before training, whose
@@ -96,7 +95,7 @@ def style_sheet(
 def _pictures(camera: Camera, scene: Scene, seed: int) -> list[np.ndarray]:
     """The scene, the camera's picture before its style stage, and after it if there is one."""
     scene = scene.samples([0])
-    split = next((i for i, stage in enumerate(camera) if isinstance(stage, _PAINTING)), len(camera))
+    split = next((i for i, stage in enumerate(camera) if isinstance(stage, PAINTING)), len(camera))
     generator = torch.Generator(scene.device).manual_seed(seed)
     pictures = [scene.to_srgb(), camera[:split](scene, generator=generator)]
     if split < len(camera):

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from kcam import __version__, files, isp, plots, report, style
-from kcam.camera import Camera
+from kcam.camera import PAINTING, Camera
 from kcam.inputs import named
 from kcam.plain import from_json
 from kcam.scene import Scene, read_picture
@@ -30,8 +30,6 @@ fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 SHOWN = ("astronaut", "coffee", "chelsea")
 SHOWN_SIZE = 256
 FEATURES = ("steerable", "vgg16")
-PAINTING = (isp.StyleStage, isp.TextureTransfer)
-"""Stages behind the camera that paint."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +39,8 @@ class Options:
     style: a picture's path, or the name of one of `kcam.style.STYLES`. out: the camera to write, .safetensors; beside
     it stands a folder of its name with checkpoints, pictures and the report. patches: a patch store; photos: a folder
     of photographs; neither: the built-in scenes. camera: a saved one to start from. features: "steerable" or "vgg16",
-    with vgg_weights. stage: False takes off what paints, network or pieces. style_size: longer side that the style is shrunk to; None:
-    as it is.
+    with vgg_weights. stage: False takes off what paints, network or pieces. style_size: longer side that the style is
+    shrunk to; None: as it is.
     """
 
     style: str
@@ -365,7 +363,7 @@ def _write_report(path: Path, options: Options, settings: Any, trained: style.Tr
         advice=trained.advice,
         notes=[
             "A camera alone can bring the colours of a style, not its strokes: its optics only take detail away, its "
-            "filter and matrix act on each pixel. What brings strokes stands behind it: pieces of the style itself, or a "
-            "network."
+            "filter and matrix act on each pixel. What brings strokes stands behind it: pieces of the style "
+            "itself, or a network."
         ],
     )

@@ -177,6 +177,7 @@ PICTURES: dict[str, Door] = {
         lambda x: a_style()(torch.rand(rows(x), 3, 64, 64), x), SCALED, side=64, optional=frozenset({"nothing"})
     ),
     "StyleStage": Door(isp.StyleStage(), SCALED, side=16),
+    "TextureTransfer": Door(isp.TextureTransfer(style.painting("mosaic", size=64), turns=1), SCALED, side=16),
     "Mosaic": Door(sensor.Mosaic(), SCALED | {"clips"}),
     "ToneCurve": Door(isp.ToneCurve(), SCALED | {"clips"}),
     "Convolution": Door(isp.Convolution(), SCALED | {"clips"}),

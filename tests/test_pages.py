@@ -424,6 +424,7 @@ def test_stages_in_the_table_are_stages() -> None:
     lens = optics.Lens(optics.CircularAperture(1e-3), optics.ThinLens(1e-2), focus_distance=1.0)
     rows = re.findall(r"^\| `((?:optics|sensor|isp)\..*?)` \|", page("understand/camera"), re.MULTILINE)
     names = {"optics": optics, "sensor": sensor, "isp": isp, "lens": lens, "um": um, "nm": nm, "torch": torch}
+    names["painting"] = kcam.style.painting("strokes", size=64)
     stages = [eval(row, names) for row in rows]
     assert all(isinstance(stage, kcam.Stage) for stage in stages)
     public = {

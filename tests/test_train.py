@@ -118,7 +118,7 @@ def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None
     [
         ({"style": "monet"}, r'unknown style "monet": expected a picture file, or one of strokes'),
         ({"style": "no.png"}, r"there is no file no.png"),
-        ({"preset": "slow"}, r'unknown preset "slow"; there are: quick, standard, thesis'),
+        ({"preset": "slow"}, r'unknown preset "slow"; there are: pieces, quick, standard, thesis'),
         ({"features": "resnet"}, r'unknown features "resnet"; there are: steerable, vgg16'),
         ({"features": "vgg16"}, r"needs --vgg-weights: the path of torchvision's vgg16-397923af.pth"),
         ({"vgg_weights": "w.pth"}, r"--vgg-weights are for --features vgg16"),

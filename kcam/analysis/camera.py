@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kcam import isp, optics, sensor, spectral, srgb
 from kcam.analysis.edge import EdgeResponse, slanted_edge_mtf
 from kcam.analysis.noise import NoisePower, noise_power_spectrum
-from kcam.camera import DEMOSAICING, Camera
+from kcam.camera import DEMOSAICING, PAINTING, Camera
 from kcam.scene import Scene
 
 FINE = 4  # samples per pixel of the light on the sensor: no lens that is used passes twice the pixels' frequency
@@ -147,7 +147,7 @@ def _behind(camera: Camera) -> Camera:
 def _raw_part(camera: Camera) -> Camera:
     """From the light on the pixels to the raw."""
     after = _behind(camera)
-    ends = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve, isp.StyleStage, isp.TextureTransfer)
+    ends = (*DEMOSAICING, isp.WhiteBalance, isp.ColourMatrix, isp.ToneCurve, *PAINTING)
     end = next((index for index, stage in enumerate(after) if isinstance(stage, ends)), len(after))
     return after[:end]
 

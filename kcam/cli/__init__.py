@@ -417,7 +417,7 @@ def train(
     ] = "",
     camera: Annotated[str, typer.Option("--camera", help="a saved camera to start from")] = "",
     stage: Annotated[
-        bool, typer.Option("--stage/--no-stage", help="with what paints behind the camera, or the camera alone")
+        bool, typer.Option("--stage/--no-stage", help="with what paints behind it, or the camera alone")
     ] = True,
     features: FeaturesOption = "steerable",
     vgg_weights: WeightsOption = "",

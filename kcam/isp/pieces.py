@@ -140,6 +140,14 @@ class _Laid:
         self.misfit[sites] = misfit[taken].gather(1, best)[:, 0]
         self.shown[sites] = book.shown[self.places[sites]]
 
+    def _at_seams(self, sites: Tensor) -> Tensor:
+        """Whether two pieces meet at these pixels: inside of one, another place would have seams all around."""
+        meets = torch.zeros_like(sites, dtype=torch.bool)
+        for dy, dx in BESIDE:
+            beside, inside = self._neighbour(sites, dy, dx)
+            meets |= inside & (self.places[beside] - (dy * self.book.width + dx) != self.places[sites])
+        return meets
+
     def round(self, generator: torch.Generator) -> None:
         """Offer to each pixel the pieces of its neighbours, places near its own, and some by chance."""
         book, allowed = self.book, self.allowed
@@ -170,6 +178,8 @@ class _Laid:
         for offers in (*ways, near, anywhere):
             for half in self.halves:
                 for sites in half.split(AT_ONCE):
+                    if len(self.sites) >= SMALL and offers in (near, anywhere):
+                        sites = sites[self._at_seams(sites)]
                     self.offer(sites, offers(sites))
 
 
@@ -191,33 +201,29 @@ def lay_pieces(
     Source:    Pritch, Kav-Venaki and Peleg, Shift-map image editing, ICCV 2009, the sum; Barnes et al., PatchMatch,
                SIGGRAPH 2009, the offers; Besag, On the statistical analysis of dirty pictures (1986), the descent.
     """
-    places = torch.zeros(0, dtype=torch.long)
-    before: _Laid | None = None
+    laid: _Laid | None = None
     for book, wanted, weight, count in zip(books, asked, weights, rounds, strict=True):
         flat, heavy = (plane.flatten(1).T.contiguous() for plane in (wanted, weight))
-        laid = _Laid(book, flat, heavy, (wanted.shape[1], wanted.shape[2]), seam)
-        if before is None:
-            some = (torch.rand(FIRST, generator=generator, device=generator.device) * len(book.places)).long()
-            places = laid.best_of(book.places[some.clamp(max=len(book.places) - 1).to(flat.device)])
+        coarser, laid = laid, _Laid(book, flat, heavy, (wanted.shape[1], wanted.shape[2]), seam)
+        if coarser is None:
+            some = (torch.rand(FIRST, generator=generator, device=generator.device) * len(laid.allowed)).long()
+            laid.lay(laid.best_of(laid.allowed[some.clamp(max=len(laid.allowed) - 1).to(flat.device)]))
         else:
-            places = _finer(places, before, laid)
-        laid.lay(places)
+            laid.lay(_finer(coarser, laid))
         for _ in range(count):
             laid.round(generator)
-        before, places = laid, laid.places
-    assert before is not None
-    return places.view(before.height, before.width)
+    if laid is None:
+        raise ValueError("no levels: expected a book of the exemplar for at least one.")
+    return laid.places.view(laid.height, laid.width)
 
 
-def _finer(places: Tensor, coarse: _Laid, fine: _Laid) -> Tensor:
+def _finer(coarse: _Laid, fine: _Laid) -> Tensor:
     """Each piece at twice the size."""
     row, column = fine.sites // fine.width, fine.sites % fine.width
     above = (row // 2).clamp(max=coarse.height - 1) * coarse.width + (column // 2).clamp(max=coarse.width - 1)
-    turn, down, right = coarse.book.at(places[above])
-    book = fine.book
-    allowed = book.places
-    nearest = allowed[torch.searchsorted(allowed, places[above] % len(allowed)).clamp(max=len(allowed) - 1)]
-    return book.place(turn, 2 * down + row % 2, 2 * right + column % 2, nearest)
+    turn, down, right = coarse.book.at(coarse.places[above])
+    any_other = fine.allowed[coarse.places[above] % len(fine.allowed)]  # a border is wider there: it happens
+    return fine.book.place(turn, 2 * down + row % 2, 2 * right + column % 2, any_other)
 
 
 def windows(side: int) -> Iterator[tuple[int, int, float]]:

@@ -134,7 +134,7 @@ PRESETS: dict[str, Preset] = {
         "the camera alone is trained, and paints with pieces of the style: a minute on a laptop",
         partial(style_camera, stage=False),
         PAINTED,
-        Settings(steps=150),
+        Settings(steps=150, rates={part: rate for part, rate in Settings().rates.items() if part != "stage"}),
         pieces=True,
     ),
     "quick": Preset(

@@ -43,7 +43,7 @@ def between(one: float, other: float) -> float:
 def test_a_picture_is_made_of_colours_of_the_exemplar() -> None:
     levels = torch.tensor([0.1, 0.5, 0.9])
     exemplar = levels[torch.arange(64) % 12 // 4].expand(3, 64, 64)
-    painted = texture_transfer(torch.rand(1, 3, 40, 48), exemplar=exemplar, turns=1, generator=seeded())
+    painted = texture_transfer(torch.rand(1, 3, 40, 48), exemplar=exemplar, glaze=0.0, turns=1, generator=seeded())
     apart = (painted[..., None] - levels).abs().amin(-1)
     assert float((apart < 1e-5).float().mean()) > 0.7  # the others are where two pieces meet
     assert float(painted.min()) >= 0.1 - 1e-6
@@ -71,10 +71,11 @@ def test_light_and_dark_are_kept_and_more_of_them_by_more_weight() -> None:
     picture = Scene.builtin("astronaut", size=96).to_srgb()
     exemplar = painting("strokes", size=128)
     kept = []
-    for detail in (0.1, 3.0, 30.0):
-        painted = texture_transfer(picture, exemplar=exemplar, detail=detail, generator=seeded())
-        soft = [torch.nn.functional.avg_pool2d(x.mean(1, keepdim=True), 4).flatten() for x in (picture, painted)]
-        kept.append(float(torch.corrcoef(torch.stack(soft))[0, 1]))
+    for detail in (0.0, 2.0, 20.0):
+        painted = texture_transfer(picture, exemplar=exemplar, detail=detail, glaze=0.0, generator=seeded())
+        soft = [torch.nn.functional.avg_pool2d(x.mean(1, keepdim=True), 5, 1, 2) for x in (picture, painted)]
+        beside = [(x - torch.nn.functional.avg_pool2d(x, 21, 1, 10)).flatten() for x in soft]
+        kept.append(float(torch.corrcoef(torch.stack(beside))[0, 1]))
     assert kept[0] < kept[1] < kept[2]
     assert kept[2] > 0.6
 
@@ -153,10 +154,10 @@ def test_gradients_of_exemplar_glaze_and_picture() -> None:
         assert bool(slope.isfinite().all())
         assert float(slope.abs().max()) > 0
         along = torch.randn(value.shape, dtype=torch.float64, generator=seeded(2))
-        step = 1e-9  # no piece moves
+        step = 1e-10  # no piece moves
         ends = [painted(*(v.detach() + sign * step * along if i == index else v.detach() for i, v in enumerate(given)))
                 for sign in (1, -1)]  # fmt: skip
-        assert float((ends[0] - ends[1]) / (2 * step)) == pytest.approx(float((slope * along).sum()), rel=1e-4)
+        assert float((ends[0] - ends[1]) / (2 * step)) == pytest.approx(float((slope * along).sum()), rel=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 8)])

@@ -174,7 +174,7 @@ assert torch.equal(again, shots["With style stage"][0])
 #
 # .. code-block:: sh
 #
-#    kcam train strokes --steps 400 --out painter.safetensors
+#    kcam train strokes --preset quick --steps 400 --out painter.safetensors
 #    kcam train starry_night.jpg --photos holiday/ --out painter.safetensors   # pictures of your own
 #    kcam train strokes --no-stage --out alone.safetensors                     # the camera alone
 #    kcam shoot photo.jpg --camera painter.safetensors --seed 3 --out shot.png
