@@ -894,7 +894,7 @@ def command_line() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "style": lambda: style_table("ours", style="style", note="what trains"),
-    "seeds": lambda: style_table("seeds", style="style", seed="seed"),
+    "seeds": lambda: style_table("seeds", style="style", note="what trains", seed="seed"),
     "whole": lambda: style_table("whole", style="style"),
     "thesis": lambda: style_table("thesis", note="arrangement", style="style"),
     "propagators": propagators_table,

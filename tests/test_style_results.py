@@ -25,10 +25,9 @@ def committed(style: str, arm: str) -> dict[str, Any]:
 def test_every_arm_was_run_for_each_of_its_styles() -> None:
     expected = {(style, name) for name, arm in benchmark.ARMS.items() for style in arm.styles}
     assert {(row["style"], row["arm"]) for row in ROWS} == expected
-    assert {(row["style"], row["arm"], row["seed"]) for row in AGAIN} == {
-        ("strokes", "stage", 1),
-        ("strokes", "stage", 2),
-    }
+    again = {("strokes", "stage", 1), ("strokes", "stage", 2)}
+    again |= {(style, "pieces", seed) for style in STYLES for seed in (1, 2)}
+    assert {(row["style"], row["arm"], row["seed"]) for row in AGAIN} == again
 
 
 @pytest.mark.parametrize("style", STYLES)
@@ -63,7 +62,8 @@ def test_what_docs_say_of_the_aims(style: str) -> None:
 
 def test_what_docs_say_of_seeds() -> None:
     for row in AGAIN:
-        check_aims(row, missed=set())
+        if row["arm"] == "stage":
+            check_aims(row, missed=set())
     assert 0.55 <= committed("strokes", "stage")["mean"]["oriented_texture"] < 0.56  # "by less than 1 %"
 
 
@@ -84,9 +84,29 @@ def test_what_docs_say_of_whole_paintings() -> None:
     assert f"woodcut misses the first two by {first} and {second} %" in DOCS
 
 
+def test_what_docs_say_of_pieces() -> None:
+    """Ends of what the three seeds of all styles gave, and what each is beside the network's."""
+    rows = [row for row in ALL if row["arm"] == "pieces"]
+    ends = {name: [end(row["mean"][name] for row in rows) for end in (min, max)] for name in rows[0]["mean"]}
+    low, high = (round(100 * value) for value in ends["oriented_texture"])
+    assert f"oriented texture {low} to {high} %" in DOCS
+    low, high = ends["detail_correlation"]
+    assert f"detail {low:.2f} to {high:.2f}" in DOCS
+    low, high = (round(100 * value) for value in ends["patch_swd"])
+    assert f"patch SWD {low} to {high} %" in DOCS
+    for style in STYLES:
+        pieces, network = (committed(style, arm)["mean"] for arm in ("pieces", "stage"))
+        assert pieces["oriented_texture"] > network["oriented_texture"] + 0.08
+        assert pieces["detail_correlation"] < network["detail_correlation"]
+        assert pieces["luminance_correlation"] < network["luminance_correlation"]
+        own = [row["mean"]["oriented_texture"] for row in rows if row["style"] == style]
+        assert max(own) - min(own) < 0.04
+
+
+@pytest.mark.parametrize("arm", ["stage", "pieces"])
 @pytest.mark.parametrize("style", STYLES)
-def test_no_shot_is_a_wallpaper(style: str) -> None:
-    assert committed(style, "stage")["wallpaper"] < 0.45
+def test_no_shot_is_a_wallpaper(style: str, arm: str) -> None:
+    assert committed(style, arm)["wallpaper"] < 0.3
 
 
 @pytest.mark.parametrize("name", ["style", "style-parts", "style-thesis", "painted"])

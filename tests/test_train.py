@@ -212,7 +212,7 @@ def test_it_starts_from_a_saved_camera(tmp_path: Path, trained: Path, monkeypatc
         run(tmp_path / f"{stage}.safetensors", camera=str(trained), stage=stage, steps=1)[0].camera
         for stage in (True, False)
     )
-    assert isinstance(with_stage[-1], isp.StyleStage)
+    assert isinstance(with_stage[-1], isp.TextureTransfer)
     assert len(without) == len(with_stage) - 1
     assert isinstance(without[-1], isp.ToneCurve)
 
