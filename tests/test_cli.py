@@ -626,3 +626,25 @@ def test_the_command_loads_no_more_than_it_must() -> None:
     code = f"import sys, kcam.cli; print([name for name in {late} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_paint_with_pieces(tmp_path: Path, photo: Path) -> None:
+    out, again = tmp_path / "painted.png", tmp_path / "again.png"
+    for path in (out, again):
+        assert run("paint", photo, "--style", "mosaic", "--size", 64, "--seed", 3, "--out", path).strip() == str(path)
+    assert out.read_bytes() == again.read_bytes()
+    with Image.open(out) as painted:
+        assert max(painted.size) <= 64
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--by", "pieces", "--steps", 3), "--by pieces takes no --steps"),
+        (("--by", "magic"), 'unknown way to paint "magic": expected pieces or loss'),
+    ],
+)
+def test_ways_to_paint_that_are_none(tmp_path: Path, photo: Path, arguments: tuple, text: str) -> None:
+    assert text in fails("paint", photo, *arguments, "--out", tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+    assert "--by pieces needs a photograph to paint" in fails("paint", "--by", "pieces", "--out", tmp_path / "a.png")
