@@ -231,7 +231,7 @@ def texture_transfer(
                generator: of what chance offers; None for torch's default one.
     Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
                and the glaze as far as that is laid over: which piece lies where has no slope.
-    Raises:    TypeError, ValueError for what is no picture, or an exemplar that is too small or flat.
+    Raises:    TypeError, ValueError for what is no picture, NaN, or an exemplar that is too small or flat.
     Source:    Efros and Freeman, Image quilting for texture synthesis and transfer, SIGGRAPH 2001, texture transfer;
                Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns.
 
@@ -244,6 +244,11 @@ def texture_transfer(
     if picture.numel() == 0:
         return picture
     check_exemplar(exemplar)
+    if not picture.isfinite().all():  # tones are compared with those of the whole picture
+        count = int((~picture.isfinite()).sum())
+        raise ValueError(
+            f"picture has {count} values that are NaN or infinite. Use picture.nan_to_num() or find out why."
+        )
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
     source = _Exemplar(_cropped(exemplar.to(picture)), turns=turns, detail=detail, flow=flow, colour=colour)

@@ -200,6 +200,13 @@ def test_what_cannot_be_painted_with(exemplar: Tensor, arguments: dict, text: st
         isp.TextureTransfer(exemplar, **arguments)
 
 
+def test_nan_is_refused() -> None:
+    picture = torch.rand(1, 3, 16, 16)
+    picture[0, 1, 2, 3] = math.nan
+    with pytest.raises(ValueError, match=r"picture has 1 values that are NaN or infinite. Use picture.nan_to_num"):
+        isp.TextureTransfer(torch.rand(3, 64, 64))(picture)
+
+
 def test_it_repaints_pictures_only() -> None:
     with pytest.raises(ValueError, match=r"TextureTransfer repaints pictures \(B,3,H,W\)"):
         isp.TextureTransfer(torch.rand(3, 64, 64))(torch.rand(1, 1, 8, 8))
