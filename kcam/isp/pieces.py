@@ -11,8 +11,9 @@ and small steps suggest. What only a few pixels would gain by changing together 
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -226,20 +227,14 @@ def _finer(coarse: _Laid, fine: _Laid) -> Tensor:
     return fine.book.place(turn, 2 * down + row % 2, 2 * right + column % 2, any_other)
 
 
-def windows(side: int) -> Iterator[tuple[int, int, float]]:
-    """Steps of a square window, with the weights of a Gaussian of half a pixel."""
-    for dy in range(-side, side + 1):
-        for dx in range(-side, side + 1):
-            yield dy, dx, math.exp(-(dy * dy + dx * dx) / 0.5)
-
-
 def shown_by(book: Book, table: Tensor, places: Tensor) -> Tensor:
     """What pieces show: (E,C) at places (H,W), (C,H,W); where they meet, what those around would show, averaged."""
     height, width = places.shape
     rows, columns = torch.arange(height, device=places.device), torch.arange(width, device=places.device)
     total: Tensor | float = 0.0
     weight = 0.0
-    for dy, dx, share in windows(1):
+    for dy, dx in itertools.product((-1, 0, 1), repeat=2):
+        share = math.exp(-(dy * dy + dx * dx) / 0.5)  # a Gaussian of half a pixel
         down, right = (rows + dy).clamp(0, height - 1) - rows, (columns + dx).clamp(0, width - 1) - columns
         there = places[rows + down][:, columns + right] - down[:, None] * book.width - right
         total = total + share * table[there.flatten().clamp(0, len(table) - 1)]
