@@ -45,8 +45,8 @@ class SignalToNoise:
 
     Example:
     >>> curve = kcam.analysis.signal_to_noise(Camera.phone(), [0.5])
-    >>> round(float(curve.electrons), -2), 0.97 < float(curve.snr) / 3000**0.5 < 1.02  # of 6000 electrons
-    (3000.0, True)
+    >>> round(float(curve.electrons), -2), 0.97 < float(curve.snr) / 2812**0.5 < 1.02  # of 5625: black takes 64 of 1023
+    (2800.0, True)
     """
 
     exposures: Tensor

@@ -57,7 +57,9 @@ def test_an_exemplar_asked_for_itself_comes_back() -> None:
     assert float(torch.corrcoef(gray)[0, 1]) > 0.5  # its lights and darks, of other pieces
 
 
-@pytest.mark.parametrize("angle", [0.3, 1.2, 2.2])
+@pytest.mark.parametrize(
+    "angle", [pytest.param(a, marks=[] if a == 1.2 else [pytest.mark.slow]) for a in (0.3, 1.2, 2.2)]
+)
 def test_strokes_follow_the_picture(angle: float) -> None:
     """Stripes of another width: the exemplar's, turned as they are."""
     picture = stripes(64, angle=angle, period=24.0)[None]
@@ -160,8 +162,7 @@ def test_gradients_of_exemplar_glaze_and_picture() -> None:
         assert float((ends[0] - ends[1]) / (2 * step)) == pytest.approx(float((slope * along).sum()), rel=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 8)])
-@pytest.mark.parametrize("value", [0.0, 0.5, None])
+@pytest.mark.parametrize(("shape", "value"), [((1, 1), None), ((5, 70), 0.5), ((33, 8), None), ((33, 8), 0.0)])
 def test_pictures_of_any_size_and_even_ones(shape: tuple[int, int], value: float | None) -> None:
     picture = torch.rand(2, 3, *shape) if value is None else torch.full((2, 3, *shape), value)
     painted = texture_transfer(picture, exemplar=painting("strokes", size=64), generator=seeded())
