@@ -101,6 +101,7 @@ def test_the_independent_camera_agrees_with_the_lens_in_the_slow_limit() -> None
     assert np.abs(ours[0, 0].detach().numpy() - theirs).max() < 2e-4 * theirs.max()
 
 
+@pytest.mark.slow
 def test_two_focuses_give_all_terms_within_their_errors() -> None:
     found_ = deviations(range(1))
     assert (np.abs(found_) < 2).mean() >= 0.8
