@@ -35,13 +35,12 @@ class Book:
     """The places of an exemplar in all its turns, at one size: a place is an index into the tables.
 
     shown: (E,3), what is seen there. compared: (E,F), what it is chosen by. allowed: (E,) whether there is a pixel all
-    around it. turns, height, width: E is their product.
+    around it. height, width: of each turn, one after the other in the tables.
     """
 
     shown: Tensor
     compared: Tensor
     allowed: Tensor
-    turns: int
     height: int
     width: int
 

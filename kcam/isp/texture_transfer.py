@@ -13,11 +13,11 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
+from kcam.isp.finish import LUMINANCE
 from kcam.isp.pieces import Book, lay_pieces, shown_by, turned
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
 from kcam.ste import clip_ste
 
-LUMA = (0.2126, 0.7152, 0.0722)
 OPPONENT = ((1.0, 0.0, -1.0), (-0.5, 1.0, -0.5))
 """Red against blue, green against both."""
 LEVELS, ROUNDS = (8, 4, 2, 1), (12, 6, 4, 2)
@@ -46,7 +46,8 @@ LEAST_DEVIATION = 2e-3
 
 
 def _luma(picture: Tensor) -> Tensor:
-    return torch.einsum("c,chw->hw", picture.new_tensor(LUMA), picture)
+    """Of coded values, (H,W)."""
+    return torch.einsum("c,chw->hw", picture.new_tensor(LUMINANCE), picture)
 
 
 def _blur(planes: Tensor, sigma: float) -> Tensor:
@@ -138,12 +139,12 @@ class _Exemplar:
                 whole = F.pad(whole[None, None].to(found), [1] * 4)  # a step beyond is beyond
                 allowed = -F.max_pool2d(-whole, 3, 1)[0, 0] > 0.5
                 own.append((small[:3].flatten(1).T, small[3:].flatten(1).T, allowed.flatten()))
-        self.books, self.tones = [], Tensor()
+        self.books = []
         for level, own in zip(LEVELS, parts, strict=True):
             seen, compared, allowed = (torch.cat(part).contiguous() for part in zip(*own, strict=True))
             size = (picture.shape[1] // level, picture.shape[2] // level)
-            self.tones = compared[:, 6:]
-            self.books.append(Book(seen, compared[:, :6].contiguous(), allowed, turns, *size))
+            self.books.append(Book(seen, compared[:, :6].contiguous(), allowed, *size))
+        self.tones = compared[:, 6:]  # of the finest
 
     def scaled(self, planes: Tensor) -> Tensor:
         """Tone, what is around it, two colours and two of a direction, in the unit in which they are compared."""
@@ -175,11 +176,19 @@ def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.
     return exemplar.scaled(asked), weight, tone
 
 
-def _transferred(picture: Tensor, exemplar: _Exemplar, options: dict[str, Any], generator: torch.Generator) -> Tensor:
+def _transferred(
+    picture: Tensor,
+    exemplar: _Exemplar,
+    *,
+    local: float,
+    seam: float,
+    glaze: Tensor | float,
+    generator: torch.Generator,
+) -> Tensor:
     height, width = picture.shape[-2:]
     coarsest = LEVELS[0]
     whole = F.pad(picture[None], (0, -width % coarsest, 0, -height % coarsest), mode="replicate")[0]
-    asked, weight, tone = _asked(whole, exemplar, options["local"], generator)
+    asked, weight, tone = _asked(whole, exemplar, local, generator)
     with torch.no_grad():
         weights = torch.ones_like(asked)
         weights[0] = weight
@@ -187,13 +196,12 @@ def _transferred(picture: Tensor, exemplar: _Exemplar, options: dict[str, Any], 
             exemplar.books,
             [F.avg_pool2d(asked[None], level)[0] for level in LEVELS],
             [F.avg_pool2d(weights[None], level)[0] for level in LEVELS],
-            seam=options["seam"] / max(2 * float(exemplar.picture.detach().flatten(1).var(1).sum()), 1e-4),
+            seam=seam / max(2 * float(exemplar.picture.detach().flatten(1).var(1).sum()), 1e-4),
             rounds=ROUNDS,
             generator=generator,
         )
     book = exemplar.books[-1]
     painted = shown_by(book, book.shown, places)
-    glaze = options["glaze"]
     if isinstance(glaze, Tensor) or glaze:
         painted = painted + like(glaze, painted) * (tone - shown_by(book, exemplar.tones, places)[0])
     return clip_ste(painted, 0.0, 1.0)[:, :height, :width]
@@ -252,8 +260,8 @@ def texture_transfer(
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
     source = _Exemplar(_cropped(exemplar.to(picture)), turns=turns, detail=detail, flow=flow, colour=colour)
-    options = {"local": local, "seam": seam, "glaze": glaze}
-    return torch.stack([_transferred(one, source, options, generator) for one in picture])
+    how: Any = {"local": local, "seam": seam, "glaze": glaze, "generator": generator}
+    return torch.stack([_transferred(one, source, **how) for one in picture])
 
 
 def _cropped(exemplar: Tensor) -> Tensor:
