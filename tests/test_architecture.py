@@ -39,7 +39,12 @@ LAYERS = [
     {"kcam.__main__"},
 ]
 LAYER = {module: index for index, row in enumerate(LAYERS) for module in row}
-DATA = [{"cube"}, {"bands"}, {"readers", "patches"}, {"convert", "inspection", "dataset", "export", "photos"}]
+DATA = [
+    {"cube"},
+    {"bands", "workers"},
+    {"readers", "patches"},
+    {"convert", "inspection", "dataset", "export", "photos"},
+]
 """The same inside kcam.data: readers do not know of the store, nor the store of readers."""
 METHODS = {
     ("kcam.camera", "kcam.planner"),

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from kcam.data.bands import resampled
 from kcam.data.cube import SUFFIX, CubeError, words_of, write_source
 from kcam.data.readers import find_scenes, open_source
 from kcam.data.readers.format import Options, scene_name
+from kcam.data.workers import Workers
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _run(
         return
     left, several = list(paths), list(paths)
     while left:  # a library that crashes takes its process along: what was not done is done again, one by one
-        with ProcessPoolExecutor(min(workers, len(several)), mp_context=get_context("spawn")) as pool:
+        with Workers(min(workers, len(several))) as pool:
             running = {pool.submit(convert_one, path, out, how): path for path in several}
             for future in as_completed(running):
                 try:

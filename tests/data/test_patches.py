@@ -10,6 +10,7 @@ import shutil
 import signal
 import socket
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -728,6 +729,26 @@ def test_ctrl_c_ends_in_one_line_and_resume_goes_on(tmp_path: Path, workers: int
     call("extract_patches", folder, *options[:-4], "--out", tmp_path / "out", "--resume")
     whole = make_store(folder, tmp_path / "whole", Settings(size=64, stride=24, split=(("train", 1.0),)))
     assert content(tmp_path / "out") == content(whole)
+
+
+@pytest.mark.slow  # processes that import torch
+@pytest.mark.parametrize("tool", ["extract_patches", "convert_cubes"])
+def test_ctrl_c_at_any_moment_is_heard_by_the_parent_alone(tmp_path: Path, tool: str):
+    """Also while workers are still loading, which is where most of the moments lie."""
+    folder = make_cubes(tmp_path / "cubes", tuple(f"s{index}" for index in range(6)), height=300, width=300)
+    options = ("--size", 64, "--stride", 8, "--split", "1") if tool == "extract_patches" else ()
+    random = np.random.default_rng(7)
+    for index in range(4):
+        process = stores.start(tool, folder, *options, "--workers", 2, "--out", tmp_path / f"out{index}")
+        while len(stores.running(process.pid)) < 3 and process.poll() is None:
+            time.sleep(0.01)  # the parent, what multiprocessing keeps beside it, the first worker
+        time.sleep(random.uniform(0, 2))
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGINT)
+        _out, err = process.communicate(timeout=300)
+        assert process.returncode in (0, 130), err
+        assert "Traceback" not in err, err
+        assert not stores.left(process.pid)
 
 
 def test_errors_cross_processes():

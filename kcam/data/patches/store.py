@@ -6,21 +6,19 @@ import errno
 import json
 import os
 import shutil
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing import active_children, connection, get_context, parent_process
 from pathlib import Path
-from threading import Thread
 from typing import Any, TypedDict
 
 from kcam.data.cube import CubeError, words_of
 from kcam.data.patches.manifest import MANIFEST, WORK, manifest_bytes, read_manifest, read_record, write_record
 from kcam.data.patches.plan import SceneJob, Settings, StoreError, StorePlan
 from kcam.data.patches.scene import extract_scene
+from kcam.data.workers import Workers
 from kcam.files import replace
 from kcam.plain import from_json
 
@@ -157,33 +155,13 @@ def _spread(
     jobs: Sequence[SceneJob], settings: Settings, folder: str, workers: int
 ) -> Iterator[tuple[SceneJob, str | None]]:
     """`_run` over processes here. They end with this one, however it ends."""
-    others = active_children()
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn"), initializer=_as_worker) as pool:
+    with Workers(min(workers, len(jobs))) as pool:
         running = {pool.submit(work_on, job, settings, folder): job for job in jobs}
         try:
             for future in as_completed(running):
                 yield running[future], future.result()
         except BrokenProcessPool as error:
             raise StoreStopped("a worker process was killed; out of memory? Go on with fewer --workers.") from error
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for child in active_children():
-                if child not in others:
-                    child.terminate()
-            raise
-
-
-def _as_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it: a worker that outlives it would wait for work forever."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = parent_process()
-    if parent is not None:
-
-        def end() -> None:
-            connection.wait([parent.sentinel])
-            os._exit(1)
-
-        Thread(target=end, daemon=True).start()
 
 
 def work_on(job: SceneJob, settings: Settings, out: str) -> str | None:
