@@ -1,11 +1,11 @@
 """Pieces of an exemplar, such as a painting, laid so that they fit what is asked for and each other.
 
     minimise over places s(p):  sum_p |f(s(p)) - g(p)|^2_w(p) + k sum_(p, q neighbours) |e(s(p)) - e(s(q) + p - q)|^2
-                                                                                      + |e(s(p) + q - p) - e(s(q))|^2
+                                                    + |e(s(p) + q - p) - e(s(q))|^2 + j [s(p) - p is not s(q) - q]
 
 e is what the exemplar shows, f what is compared of it, g what is asked for. Neighbours whose places are neighbours too
 cost nothing: the exemplar goes on as it is, and pieces grow; where two meet, the sum asks that each would show what the
-other does. The least is looked for from an eighth of the size on, pixel by pixel, among places that neighbours, chance
+other does, and something that they meet at all. The least is looked for from an eighth of the size on, pixel by pixel, among places that neighbours, chance
 and small steps suggest. What only a few pixels would gain by changing together is found at the coarser levels.
 """
 
@@ -28,6 +28,7 @@ JUMPS = (1, 2, 4, 1)  # pixels: how far away a neighbour's piece is offered
 SMALL = 8000  # pixels of a level that chance can help
 CHANCES, FEW = 24, 4  # places by chance in a round, of a small level and of others
 AT_ONCE = 2**15  # pixels
+SOFT = 0.5  # pixels: Gaussian by which pieces are averaged where they meet
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,10 @@ def turned(planes: Tensor, angle: float, *, mode: str = "bilinear") -> tuple[Ten
 class _Laid:
     """Pieces on one picture at one level, while they are being laid."""
 
-    def __init__(self, book: Book, asked: Tensor, weights: Tensor, shape: tuple[int, int], seam: float) -> None:
-        self.book, self.asked, self.weights, self.seam = book, asked, weights, seam
+    def __init__(
+        self, book: Book, asked: Tensor, weights: Tensor, shape: tuple[int, int], seam: float, joint: float
+    ) -> None:
+        self.book, self.asked, self.weights, self.seam, self.joint = book, asked, weights, seam, joint
         self.height, self.width = shape
         self.sites = torch.arange(self.height * self.width, device=asked.device)
         row, column = self.sites // self.width, self.sites % self.width
@@ -128,8 +131,11 @@ class _Laid:
             beside, inside = self._neighbour(sites, dy, dx)
             step = dy * book.width + dx
             theirs, there = book.shows(self.places[beside] - step)[:, None], self.shown[beside, None]
+            goes_on = self.places[beside, None] - step
             seams = [
-                (mine - theirs).square().sum(2) + (book.shows(place + step) - there).square().sum(2)
+                (mine - theirs).square().sum(2)
+                + (book.shows(place + step) - there).square().sum(2)
+                + self.joint * (place != goes_on)
                 for mine, place in ((after, places), (before, now))
             ]
             gain += self.seam * inside[:, None] * (seams[0] - seams[1])
@@ -190,13 +196,14 @@ def lay_pieces(
     weights: Sequence[Tensor],
     *,
     seam: float,
+    joint: float = 0.0,
     rounds: Sequence[int],
     generator: torch.Generator,
 ) -> Tensor:
     """Choose a place of an exemplar for each pixel of a picture, from the coarsest level to the finest.
 
     Args:      books: of each level, each twice as large as the one before.  asked, weights: (F,h,w) of each level.
-               seam: k.  rounds: of each level.  generator: of what chance offers.
+               seam, joint: k and j.  rounds: of each level.  generator: of what chance offers.
     Returns:   (H,W) indices into the last book.
     Source:    Pritch, Kav-Venaki and Peleg, Shift-map image editing, ICCV 2009, the sum; Barnes et al., PatchMatch,
                SIGGRAPH 2009, the offers; Besag, On the statistical analysis of dirty pictures (1986), the descent.
@@ -204,7 +211,7 @@ def lay_pieces(
     laid: _Laid | None = None
     for book, wanted, weight, count in zip(books, asked, weights, rounds, strict=True):
         flat, heavy = (plane.flatten(1).T.contiguous() for plane in (wanted, weight))
-        coarser, laid = laid, _Laid(book, flat, heavy, (wanted.shape[1], wanted.shape[2]), seam)
+        coarser, laid = laid, _Laid(book, flat, heavy, (wanted.shape[1], wanted.shape[2]), seam, joint)
         if coarser is None:
             some = (torch.rand(FIRST, generator=generator, device=generator.device) * len(laid.allowed)).long()
             laid.lay(laid.best_of(laid.allowed[some.clamp(max=len(laid.allowed) - 1).to(flat.device)]))
@@ -233,7 +240,7 @@ def shown_by(book: Book, table: Tensor, places: Tensor) -> Tensor:
     total: Tensor | float = 0.0
     weight = 0.0
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
-        share = math.exp(-(dy * dy + dx * dx) / 0.5)  # a Gaussian of half a pixel
+        share = math.exp(-(dy * dy + dx * dx) / (2 * SOFT**2))
         down, right = (rows + dy).clamp(0, height - 1) - rows, (columns + dx).clamp(0, width - 1) - columns
         there = places[rows + down][:, columns + right] - down[:, None] * book.width - right
         total = total + share * table[there.flatten().clamp(0, len(table) - 1)]

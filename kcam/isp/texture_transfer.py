@@ -28,12 +28,20 @@ MOST = 2**19
 """Pixels of an exemplar: of a larger one the middle is taken. In eight turns it takes 150 MB."""
 FINE, WIDE = 2.0, 10.0
 """Gaussians of the tone that is compared, and of what is around it [pixels]."""
-AROUND = 16.0
-"""Gaussian of the neighbourhood in which contrast is evened out [pixels]."""
-FAINT = 0.12
-"""Contrast that counts half, of the picture's."""
-EVEN = 0.05
+AROUND, NEAR = 16.0, 3.0
+"""Gaussians [pixels] of the contrast that is evened out, and of that which says where a picture is even."""
+FAINT, EVENED = 0.25, 0.4
+"""Contrast, of the picture's, that counts half where it says what is even, and where it is evened out."""
+GAIN = 1.5
+"""Contrast that is asked for, of the exemplar's: strokes hide some of it."""
+EVEN = 0.01
 """Share of its weight that the tone keeps where the picture is even: there the exemplar's own texture is free."""
+JOINT = 0.03
+"""What a seam costs where its colours agree: without it even areas are the same few pixels again and again."""
+GLAZED = 3.0
+"""Gaussian of the tone that is laid over [pixels]: it spares the strokes."""
+STEADY = 0.1
+"""Of the exemplar's covariance of colours, added to both: of a picture that shows one tone little is made."""
 SLOPE, ALONG = 1.0, 4.0
 """Gaussians of the slopes whose directions are compared, and of their average [pixels]."""
 FURTHER = (8.0, 16.0, 32.0)
@@ -116,10 +124,10 @@ class _Exemplar:
         self.picture = picture
         luma = _luma(picture)
         tones, slopes = _tones(luma), _directions(luma)
-        self.tone = tones.sum(0)
+        self.tones = tones
         self.scales = [
             math.sqrt(detail / max(float(tones[0].detach().var()), 1e-6)),
-            1 / max(float(self.tone.detach().std()), 1e-3),
+            1 / max(float(tones.detach().sum(0).std()), 1e-3),
             math.sqrt(flow),
             math.sqrt(colour),
         ]
@@ -132,7 +140,7 @@ class _Exemplar:
             found = turned(planes, angle)[0]
             cos, sin = math.cos(2 * angle), math.sin(2 * angle)
             along = torch.stack([cos * found[4] - sin * found[5], sin * found[4] + cos * found[5]])
-            found = torch.cat([seen.clamp(0, 1), self.scaled(torch.cat([found[:4], along])), found[:2].sum(0)[None]])
+            found = torch.cat([seen.clamp(0, 1), self.scaled(torch.cat([found[:4], along]))])
             for level, own in zip(LEVELS, parts, strict=True):
                 small = F.avg_pool2d(found[None], level)[0]
                 whole = F.avg_pool2d(inside[None, None].to(found), level)[0, 0] > 1 - 1e-4
@@ -143,8 +151,7 @@ class _Exemplar:
         for level, own in zip(LEVELS, parts, strict=True):
             seen, compared, allowed = (torch.cat(part).contiguous() for part in zip(*own, strict=True))
             size = (picture.shape[1] // level, picture.shape[2] // level)
-            self.books.append(Book(seen, compared[:, :6].contiguous(), allowed, *size))
-        self.tones = compared[:, 6:]  # of the finest
+            self.books.append(Book(seen, compared, allowed, *size))
 
     def scaled(self, planes: Tensor) -> Tensor:
         """Tone, what is around it, two colours and two of a direction, in the unit in which they are compared."""
@@ -153,17 +160,17 @@ class _Exemplar:
 
 
 def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.Generator) -> tuple[Tensor, ...]:
-    """Of a picture (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (H,W)."""
+    """Of a picture (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (1,H,W)."""
     luma = _luma(picture)
-    soft = _blur(luma[None], FINE)
-    mean = _blur(soft, AROUND)
-    deviation = (_blur((soft - mean).square(), AROUND) + 1e-8).sqrt()
-    faint = FAINT * soft.std() + 1e-4
-    mixed = (1 - local) * _standard(soft) + local * (soft - mean) / (deviation + faint)
-    tone = _with_tones_of(mixed[0], exemplar.tone)
-    wide = _blur(tone[None], WIDE)
-    contrast = (_blur((soft - _blur(soft, 4 * FINE)).square(), 1.5 * FINE)[0] + 1e-8).sqrt()
-    weight = EVEN + (1 - EVEN) * contrast / (contrast + faint)
+    fine, wide = (part[None] for part in _tones(luma))
+    spread = fine.std(correction=0) + 1e-4
+    near, around = ((_blur(fine.square(), sigma) + 1e-8).sqrt() for sigma in (NEAR, AROUND))
+    weight = EVEN + (1 - EVEN) * near[0] / (near[0] + FAINT * spread)
+    fine = (1 - local) * fine / spread + local * fine / (around + EVENED * spread)
+    theirs = exemplar.tones[0]
+    most = theirs.detach().abs().flatten().kthvalue(math.ceil(0.995 * theirs.numel())).values + 1e-4
+    fine = most * torch.tanh(GAIN * theirs.std() * fine / (fine.std(correction=0) + 1e-4) / most)
+    wide = _with_tones_of(wide, exemplar.tones[1])
     near = _directions(luma)
     slopes = near + 0.1 * sum(_blur(near, sigma) for sigma in FURTHER)
     known = slopes[2] / (slopes[2] + 1e-4)
@@ -172,8 +179,8 @@ def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.
     chance = F.interpolate(_blur(chance, 2.0)[None], size=luma.shape, mode="bicubic")[0]
     flow = slopes[:2] / (slopes[2] + 1e-9) * known + (1 - known) * chance / (chance.norm(dim=0).mean() + 1e-9)
     flow = 0.8 * flow / (flow.norm(dim=0) + 1e-6)
-    asked = torch.cat([tone[None] - wide, wide, _colours(picture), flow])
-    return exemplar.scaled(asked), weight, tone
+    asked = torch.cat([fine, wide, _colours(picture), flow])
+    return exemplar.scaled(asked), weight, fine + wide
 
 
 def _transferred(
@@ -183,6 +190,7 @@ def _transferred(
     local: float,
     seam: float,
     glaze: Tensor | float,
+    palette: float,
     generator: torch.Generator,
 ) -> Tensor:
     height, width = picture.shape[-2:]
@@ -190,21 +198,37 @@ def _transferred(
     whole = F.pad(picture[None], (0, -width % coarsest, 0, -height % coarsest), mode="replicate")[0]
     asked, weight, tone = _asked(whole, exemplar, local, generator)
     with torch.no_grad():
+        unit = max(2 * float(exemplar.picture.flatten(1).var(1).sum()), 1e-4)
         weights = torch.ones_like(asked)
         weights[0] = weight
         places = lay_pieces(
             exemplar.books,
             [F.avg_pool2d(asked[None], level)[0] for level in LEVELS],
             [F.avg_pool2d(weights[None], level)[0] for level in LEVELS],
-            seam=seam / max(2 * float(exemplar.picture.detach().flatten(1).var(1).sum()), 1e-4),
+            seam=seam / unit,
+            joint=JOINT * unit,
             rounds=ROUNDS,
             generator=generator,
         )
     book = exemplar.books[-1]
     painted = shown_by(book, book.shown, places)
     if isinstance(glaze, Tensor) or glaze:
-        painted = painted + like(glaze, painted) * (tone - shown_by(book, exemplar.tones, places)[0])
+        painted = painted + like(glaze, painted) * _blur(tone - _blur(_luma(painted)[None], FINE), GLAZED)
+    if palette:
+        painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
     return clip_ste(painted, 0.0, 1.0)[:, :height, :width]
+
+
+def _with_colours_of(picture: Tensor, other: Tensor) -> Tensor:
+    """With the mean and covariance of another one's colours; what is brighter stays brighter."""
+    basis = picture.new_tensor((LUMINANCE, *OPPONENT))
+    own, theirs = (basis @ one.flatten(1) for one in (picture, other))
+    aim = torch.cov(theirs, correction=0)
+    steady = STEADY * aim + 1e-5 * torch.eye(3).to(aim)
+    have, want = (torch.linalg.cholesky(part + steady) for part in (torch.cov(own, correction=0), aim))
+    back = torch.linalg.inv(basis) @ want
+    moved = back @ torch.linalg.solve_triangular(have, own - own.mean(1, keepdim=True), upper=False)
+    return (moved + other.flatten(1).mean(1, keepdim=True)).view_as(picture)
 
 
 @in_float32
@@ -212,36 +236,40 @@ def texture_transfer(
     picture: Tensor,
     *,
     exemplar: Tensor,
-    detail: float = 4.0,
+    detail: float = 5.0,
     seam: float = 6.0,
-    flow: float = 0.5,
+    flow: float = 1.0,
     colour: float = 0.0,
-    local: float = 0.8,
-    glaze: Tensor | float = 0.2,
+    local: float = 1.0,
+    glaze: Tensor | float = 0.6,
+    palette: float = 1.0,
     turns: int = 8,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Paint pictures anew with pieces of an exemplar, which lie where tone, direction and colour ask for them.
 
-    minimise over places:  detail w (t - t')^2 / var t' + (m - m')^2 / var t' + flow |v - v'|^2 + colour |c - c'|^2
-                           + seam |where pieces meet|^2 / (2 var)                                (`pieces`)
+    minimise over places:  detail w (t - t')^2 / var t' + (m - m')^2 / var(t' + m') + flow |v - v'|^2
+                           + colour |c - c'|^2 + seam (|where pieces meet|^2 / (2 var) + 0.03)   (`pieces`)
 
-    t is the luma beside what is around it, m that around it, both brought to the exemplar's distribution, v the
-    direction of its level lines at twice the angle, c the colour around it; those with a prime are the exemplar's, in
-    each of its turns. w is small where a picture is even: there the exemplar goes on as it is. Directions flow from
-    edges into even areas; where there are none they are drawn.
+    t is the luma beside what is around it, evened out and of 1.5 times the exemplar's deviation, m that around it,
+    brought to the exemplar's distribution, v the direction of its level lines at twice the angle, c the colour around
+    it; those with a prime are the exemplar's, in each of its turns. w is small where a picture is even: there the
+    exemplar goes on as it is. Directions flow from edges into even areas; where there are none they are drawn. What
+    the pieces show, with the glaze, is brought to the mean and covariance of the exemplar's colours.
 
     Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
                own pixels; of more than half a megapixel the middle is taken.
                detail, seam, flow, colour: weights, >= 0.  local: share of the contrast that is evened out, 0..1.
-               glaze: share of the picture's own tone that is laid over the pieces, >= 0.
+               glaze: share of t + m, as far as the pieces do not show it, that is laid over them softly, >= 0.
+               palette: share of the way to the exemplar's colours, 0..1.
                turns: of the exemplar, evenly spread over a whole one; 1 leaves its strokes as they lie.
                generator: of what chance offers; None for torch's default one.
     Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
                and the glaze as far as that is laid over: which piece lies where has no slope.
     Raises:    TypeError, ValueError for what is no picture, NaN, or an exemplar that is too small or flat.
     Source:    Efros and Freeman, Image quilting for texture synthesis and transfer, SIGGRAPH 2001, texture transfer;
-               Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns.
+               Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns; Reinhard et al., Color
+               transfer between images (2001), the palette, with covariances, triangular from the luma on.
 
     Example:
     >>> stripes = (torch.arange(64) % 8 < 4).float().expand(3, 64, 64) * 0.8 + 0.1
@@ -260,7 +288,7 @@ def texture_transfer(
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
     source = _Exemplar(_cropped(exemplar.to(picture)), turns=turns, detail=detail, flow=flow, colour=colour)
-    how: Any = {"local": local, "seam": seam, "glaze": glaze, "generator": generator}
+    how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "generator": generator}
     return torch.stack([_transferred(one, source, **how) for one in picture])
 
 
@@ -279,7 +307,7 @@ class TextureTransfer(Stage):
     It learns nothing by itself: what it needs is the painting. An exemplar that is an nn.Parameter trains.
 
     Args:      exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way; it is saved with the camera.
-               detail, seam, flow, colour: weights, >= 0.  local: 0..1.  glaze: >= 0.  turns: 1 or more.
+               detail, seam, flow, colour: weights, >= 0.  local, palette: 0..1.  glaze: >= 0.  turns: 1 or more.
                seed: of what chance offers; None: from the camera's generator, each picture another one.
     Raises:    TypeError, ValueError for an exemplar that is no picture, flat or too small, or values out of range.
 
@@ -297,12 +325,13 @@ class TextureTransfer(Stage):
         self,
         exemplar: Tensor,
         *,
-        detail: float = 4.0,
+        detail: float = 5.0,
         seam: float = 6.0,
-        flow: float = 0.5,
+        flow: float = 1.0,
         colour: float = 0.0,
-        local: float = 0.8,
-        glaze: Tensor | float = 0.2,
+        local: float = 1.0,
+        glaze: Tensor | float = 0.6,
+        palette: float = 1.0,
         turns: int = 8,
         seed: int | None = None,
     ) -> None:
@@ -310,13 +339,14 @@ class TextureTransfer(Stage):
         check_exemplar(exemplar)
         for name, value in (("detail", detail), ("seam", seam), ("flow", flow), ("colour", colour), ("glaze", glaze)):
             check_not_negative(value, name=name, unit="(0 for nothing)")
-        check_not_negative(local, name="local", unit="(0 for nothing)", most=1.0)
+        for name, value in (("local", local), ("palette", palette)):
+            check_not_negative(value, name=name, unit="(0 for nothing)", most=1.0)
         for name, number, least in (("turns", turns, 1), ("seed", 0 if seed is None else seed, 0)):
             if isinstance(number, bool) or not isinstance(number, int) or number < least:
                 raise ValueError(f"{name} must be a whole number of at least {least}, got {number!r}.")
         hold(self, exemplar=exemplar, glaze=glaze)
-        self.detail, self.seam, self.flow, self.colour, self.local = detail, seam, flow, colour, local
-        self.turns, self.seed = turns, seed
+        self.detail, self.seam, self.flow, self.colour = detail, seam, flow, colour
+        self.local, self.palette, self.turns, self.seed = local, palette, turns, seed
 
     def mean(self) -> TextureTransfer:
         """One picture of those that it paints, always the same, not their mean. Shares the exemplar."""
@@ -342,6 +372,7 @@ class TextureTransfer(Stage):
             colour=self.colour,
             local=self.local,
             glaze=self.glaze,
+            palette=self.palette,
             turns=self.turns,
             generator=told if seed is None else torch.Generator("cpu").manual_seed(seed),
         )
