@@ -24,7 +24,7 @@ from scipy.stats import rankdata
 from skimage import data
 from skimage.exposure import match_histograms
 from torch import Tensor
-from torch.nn.functional import conv2d, interpolate, pad
+from torch.nn.functional import conv2d, grid_sample, interpolate, pad
 
 PATCH, PROJECTIONS = 7, 128
 STRIDES = {1: 3, 2: 1, 4: 1}  # of the patches, by level: odd, so that no colour lattice is met in one phase only
@@ -33,6 +33,13 @@ ONE_OCTAVE = 0.56  # the envelope's sigma, in wavelengths, of a Gabor filter one
 HIGH_PASS = 2.0  # sigma of what `wallpaper` takes away: it leaves the edges of strokes, not where scenes are bright
 DETAIL = (2.0, 8.0)
 QUANTILES = 2048
+SLOPE, AVERAGED = 1.0, 2.0  # sigmas of a structure tensor's slopes and of its average
+WALK, LEAVES, EVERY = 32, 0.35, 3  # pixels each way at most; colour, of the picture's deviation, that is another's; pixels
+BESIDE = 4.0  # pixels along and across
+FINEST = 0.7  # sigma of what is finer than a stroke's edge
+EDGE, HALO = (2.0, 0.1), (4.0, 14.0)  # sigma and share of the scene's edges; pixels from them
+EVEN_SIDES = 0.15  # of an edge's step, that its sides may vary by
+FACES = {"hopper": (0.16, 0.60, 0.33, 0.69)}  # top, bottom, left, right, of the side
 SMALLEST = 64  # pixels: the widest filter's reach, 3 sigma of 16 pixels, must fit for the border to be reflected
 
 
@@ -76,6 +83,121 @@ def wallpaper(pictures: Iterable[Tensor]) -> float:
     height, width = (min(g.shape[axis] for g in gray) for axis in (0, 1))
     high = [g - _blur(g, HIGH_PASS) for g in (g[:height, :width] for g in gray)]
     return max(abs(_correlation(a, b)) for a, b in itertools.combinations(high, 2))
+
+
+def face_correlation(picture: Tensor, scene: Tensor, box: tuple[float, float, float, float]) -> float:
+    """`detail_correlation` within a box, by shares of the side, from 1 pixel instead of 2: eyes, nose and mouth."""
+    _check_same_size(picture, scene)
+    height, width = picture.shape[-2:]
+    rows, columns = (slice(round(a * n), round(b * n)) for a, b, n in ((*box[:2], height), (*box[2:], width)))
+    fine = [_blur(_luma(x), DETAIL[0] / 2) - _blur(_luma(x), DETAIL[1]) for x in (picture, scene)]
+    return _correlation(*(x[rows, columns] for x in fine))
+
+
+def halo(picture: Tensor, scene: Tensor) -> float:
+    """By how much light and dark overshoot 4 pixels beside the scene's steps, of the step between 14 pixels either way.
+
+    Only where the scene itself is a step: an edge with even sides. Strokes average out over all edges.
+    """
+    _check_same_size(picture, scene)
+    gray = _blur(_luma(scene), EDGE[0])
+    dy, dx = torch.gradient(gray)
+    slope = (dx.square() + dy.square()).sqrt()
+    edges = slope >= slope.flatten().sort().values[-round(EDGE[1] * slope.numel())]
+    at = edges.nonzero().double()
+    normal = torch.stack([dy[edges], dx[edges]], -1) / slope[edges][:, None]
+
+    def profile(luma: Tensor) -> tuple[Tensor, Tensor]:
+        """Overshoot, and step, from dark to light."""
+        near, far = ([_sampled(luma[None], at + side * d * normal)[0] for side in (1, -1)] for d in HALO)
+        return ((near[0] - far[0]) + (far[1] - near[1])) / 2, far[0] - far[1]
+
+    over, step = profile(gray)
+    steps = (step > 0) & (over.abs() < EVEN_SIDES * step)
+    over, step = (part[steps] for part in profile(_luma(picture)))
+    return float(over.mean() / step.abs().mean().clamp(min=1e-6)) if len(step) else 0.0
+
+
+def stroke_length(picture: Tensor) -> float:
+    """How far one can walk along the local direction, both ways, until the colour is another one [pixel], on average.
+
+    Another one: by 0.35 of the deviation of all colours, so that contrast does not count. At most 64.
+    """
+    colours, directions, _ = _strokes(picture)
+    start = _places(colours)
+    first = _sampled(colours, start)
+    length = torch.zeros(len(start), dtype=torch.float64)
+    for sense in (1.0, -1.0):
+        at, going = start.clone(), sense * _along(directions, start)
+        walks = torch.ones(len(start), dtype=torch.bool)
+        for _ in range(WALK):
+            at = at + going
+            turned = _along(directions, at)
+            going = turned * (turned * going).sum(-1, keepdim=True).sign()
+            inside = ((at >= 0) & (at <= torch.tensor(colours.shape[-2:]) - 1)).all(-1)
+            walks &= inside & ((_sampled(colours, at) - first).norm(dim=0) < LEAVES)
+            length += walks
+    return float(length.mean())
+
+
+def along_across(picture: Tensor) -> float:
+    """Colours' mean difference over 4 pixels along the local direction, of that across: what a stroke keeps as one."""
+    colours, directions, _ = _strokes(picture)
+    start = _places(colours)
+    along = _along(directions, start)
+    across = torch.stack([-along[:, 1], along[:, 0]], -1)
+    here = _sampled(colours, start)
+    apart = [(_sampled(colours, start + BESIDE * way) - here).norm(dim=0).mean() for way in (along, across)]
+    return float(apart[0] / apart[1].clamp(min=1e-9))
+
+
+def coherence(picture: Tensor, other: Tensor) -> float:
+    """Wasserstein distance between the coherences of two pictures' structure tensors: 0 of no direction, 1 of one."""
+    return _apart(*([_quantiles(_strokes(x)[2].flatten()[None])] for x in (picture, other)))
+
+
+def pixel_noise(picture: Tensor) -> float:
+    """Luma less its Gaussian of 0.7 pixels, of the luma's deviation: mazes and grain, finer than a stroke's edge."""
+    gray = _luma(picture)
+    return float((gray - _blur(gray, FINEST)).std() / gray.std().clamp(min=1e-6))
+
+
+def seen(shot: Tensor, *, scene: Tensor, style: Tensor, face: tuple[float, ...] | None = None) -> dict[str, float]:
+    """What the eye sees of strokes, beside the style's own: ratios, 1 being the style; see each measure."""
+    ratios = {f.__name__: f(shot) / f(style) for f in (stroke_length, along_across, pixel_noise)}
+    row = {**ratios, "coherence": coherence(shot, style), "halo": halo(shot, scene)}
+    return row if face is None else {**row, "face": face_correlation(shot, scene, face)}
+
+
+def _strokes(picture: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours over their deviation (3,H,W), directions at twice the angle (2,H,W), coherence (H,W)."""
+    picture = _checked(picture).double()
+    dy, dx = torch.gradient(_blur(_luma(picture), SLOPE))
+    xx, xy, yy = (_blur(part, AVERAGED) for part in (dx * dx, dx * dy, dy * dy))
+    twice = torch.stack([yy - xx, -2 * xy])  # of the level lines
+    energy = xx + yy
+    colours = picture - picture.flatten(1).mean(1)[:, None, None]
+    return colours / colours.square().sum(0).mean().sqrt().clamp(min=1e-6), twice, twice.norm(dim=0) / (energy + 1e-9)
+
+
+def _places(planes: Tensor) -> Tensor:
+    """Rows and columns (N,2) of every third pixel each way."""
+    rows, columns = (torch.arange(EVERY // 2, side, EVERY, dtype=torch.float64) for side in planes.shape[-2:])
+    return torch.cartesian_prod(rows, columns)
+
+
+def _sampled(planes: Tensor, at: Tensor) -> Tensor:
+    """Planes (C,H,W) at rows and columns (N,2), between pixels by lines, (C,N)."""
+    height, width = planes.shape[-2:]
+    grid = torch.stack([at[:, 1] * 2 / (width - 1), at[:, 0] * 2 / (height - 1)], -1) - 1
+    return grid_sample(planes[None], grid[None, None], padding_mode="border", align_corners=True)[0, :, 0]
+
+
+def _along(directions: Tensor, at: Tensor) -> Tensor:
+    """Unit steps (row, column) along the local direction, (N,2)."""
+    cos, sin = _sampled(directions, at)
+    angle = torch.atan2(sin, cos) / 2
+    return torch.stack([angle.sin(), angle.cos()], -1)
 
 
 def gap_closed(value: float, *, ordinary: float, other: float) -> float:

@@ -20,7 +20,7 @@ from kcam.ste import clip_ste
 
 OPPONENT = ((1.0, 0.0, -1.0), (-0.5, 1.0, -0.5))
 """Red against blue, green against both."""
-LEVELS, ROUNDS = (8, 4, 2, 1), (12, 6, 4, 2)
+LEVELS, ROUNDS = (8, 4, 2, 1), (12, 10, 8, 4)
 """By how much each level is smaller, and how often its pieces are offered others."""
 LEAST = 32
 """Pixels of an exemplar's shorter side: four of the coarsest level, of which two are no border."""
@@ -236,9 +236,9 @@ def texture_transfer(
     picture: Tensor,
     *,
     exemplar: Tensor,
-    detail: float = 5.0,
+    detail: float = 4.0,
     seam: float = 6.0,
-    flow: float = 1.0,
+    flow: float = 2.0,
     colour: float = 0.0,
     local: float = 1.0,
     glaze: Tensor | float = 0.6,
@@ -325,9 +325,9 @@ class TextureTransfer(Stage):
         self,
         exemplar: Tensor,
         *,
-        detail: float = 5.0,
+        detail: float = 4.0,
         seam: float = 6.0,
-        flow: float = 1.0,
+        flow: float = 2.0,
         colour: float = 0.0,
         local: float = 1.0,
         glaze: Tensor | float = 0.6,
