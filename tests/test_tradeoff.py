@@ -8,20 +8,18 @@ from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
-from typer.testing import CliRunner
 
-from kcam import Camera, cli, demo, isp, optics, plots, sensor, tradeoff
+from kcam import Camera, demo, isp, optics, plots, sensor, tradeoff
 from kcam.optics.propagation import reference
 from kcam.scene import Scene
 from kcam.tradeoff import Row, Sweep
 from kcam.units import mm, um, wavelength_grid
-
-runner = CliRunner()
 
 
 def of(result: Sweep, knob: str) -> list[Row]:
@@ -218,9 +216,7 @@ def test_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(*arguments: object, status: int = 0) -> str:
-    result = runner.invoke(cli.app, ["tradeoff", *map(str, arguments)])
-    assert result.exit_code == status, result.output
-    return result.output
+    return commands.run("tradeoff", *arguments, status=status)
 
 
 def test_the_command_writes_both_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

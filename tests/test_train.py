@@ -10,9 +10,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from kcam import files, isp, plots, train
 from kcam.camera import Camera
@@ -24,7 +24,7 @@ CHOSEN = {"stage": False, "steps": 3, "size": 64, "batch": 1}
 
 
 def invoke(command: str):
-    return CliRunner().invoke(app, command.split())
+    return commands.invoke(app, *command.split())
 
 
 def without_pictures(monkeypatch) -> None:
