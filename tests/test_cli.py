@@ -621,13 +621,6 @@ def test_the_help_of_data_and_a_wrong_command() -> None:
     assert "No such command" in run("data", "mend", status=2)
 
 
-def test_the_command_loads_no_more_than_it_must() -> None:
-    late = ("kcam.data", "kcam.style", "matplotlib", "tifffile")
-    code = f"import sys, kcam.cli; print([name for name in {late} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
-
-
 def test_paint_with_pieces(tmp_path: Path, photo: Path) -> None:
     out = tmp_path / "painted.png"
     assert run("paint", photo, "--style", "mosaic", "--size", 64, "--seed", 3, "--out", out).strip() == str(out)
