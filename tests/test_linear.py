@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections.abc import Callable
@@ -132,11 +133,20 @@ def lights() -> Tensor:
 
 
 def made(name: str, dtype: torch.dtype) -> tuple[Camera, Scene, LinearCamera, Draw]:
+    """A case, which no test changes: made once, and with it its PSFs. Each test draws from where the scene left off."""
+    camera, scene, operator, state = _made(name, dtype)
+    draw = Draw(0)
+    draw.generator.set_state(state)
+    return camera, scene, operator, draw
+
+
+@functools.cache
+def _made(name: str, dtype: torch.dtype) -> tuple[Camera, Scene, LinearCamera, Tensor]:
     draw = Draw(len(name))
     case = (CASES | SLOW)[name]
     camera, scene = case.camera(), case.scene(draw).to(dtype)
     with torch.no_grad():
-        return camera, scene, camera.linear(scene), draw
+        return camera, scene, camera.linear(scene), draw.generator.get_state()
 
 
 def signed(draw: Draw, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
