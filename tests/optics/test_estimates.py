@@ -150,7 +150,7 @@ def test_estimates_hold_for_maps_however_the_rim_cuts_them(
     assert estimate <= 5e-3
 
 
-@pytest.mark.parametrize("samples", [96, 128, 192, 400])
+@pytest.mark.parametrize("samples", [96, 128, pytest.param(192, marks=pytest.mark.slow), 400])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_estimates_hold_for_samples_that_the_user_gives(seed: int, samples: int) -> None:
     asked = random_query(seed)

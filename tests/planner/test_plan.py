@@ -58,7 +58,8 @@ def choice(plan: Plan, effect: str) -> str:
     return next(row.chosen for row in plan.decisions if row.effect == effect)
 
 
-ADVERSARIAL = (1, 8, 9, 13, 30, 37)  # of each kind of optics
+ADVERSARIAL = (8, 9, 13, 37, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 30)))
+"""Of each kind of optics; those over the field are test_field_rows' among the quick tests."""
 
 
 # ---- honesty -------------------------------------------------------------------------------------------------------
