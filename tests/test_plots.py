@@ -98,7 +98,9 @@ def seeded() -> torch.Generator:
 # ---- pipeline ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "phone" else name for name in CAMERAS]
+)  # "own" has its stages and some more
 def test_every_stage_of_every_camera_has_its_panel(name: str) -> None:
     camera, scene = CAMERAS[name](), Scene.builtin("motorcycle", 48)
     if name == "thesis":  # whose PSFs of many depths take long
