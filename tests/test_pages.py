@@ -119,7 +119,7 @@ SCRIPTS = [str(path.relative_to(DOCS)) for folder in ("lessons", "recipes", "pic
            sorted((DOCS / folder).glob("plot_*.py"))]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sampled(SCRIPTS, 2))
+@pytest.mark.parametrize("name", sampled(SCRIPTS, 1))
 def test_script_runs(name: str, tmp_path: Path) -> None:
     """As a user would, in a process of its own: warnings are errors."""
     environment = os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
