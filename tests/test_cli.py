@@ -23,7 +23,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import kcam
-from kcam import Camera, cli, demo, files, optics, plots, train
+from kcam import Camera, cli, demo, files, memory, optics, plots, train
 from kcam.cli import console
 from kcam.optics.compound import presets
 from kcam.scene import read_picture
@@ -82,10 +82,13 @@ def test_lengths() -> None:
 
 def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--version") == f"kcam {kcam.__version__}\n"
+    kept: list[bool] = []
+    monkeypatch.setattr(memory, "keep", lambda: kept.append(True))  # would hold for this process, and other tests
     monkeypatch.setattr(sys, "argv", ["kcam", "--version"])
     with pytest.raises(SystemExit, match="^0$"):
         runpy.run_module("kcam", run_name="__main__")  # python -m kcam, in this process
     assert capsys.readouterr().out == f"kcam {kcam.__version__}\n"
+    assert kept == [True]
 
 
 @pytest.mark.parametrize("camera", ["phone", "ideal"])
