@@ -207,7 +207,7 @@ def test_adversarial_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> 
     assert_inside(shot, light, (0.1, 0.01, 0.001), text)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 3])
 def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,7 +235,7 @@ def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
     assert_inside(shot, light, (0.05, 0.02, 0.005))
 
 
-@pytest.mark.parametrize("seed", [30, 31])
+@pytest.mark.parametrize("seed", [30, pytest.param(31, marks=pytest.mark.slow)])
 def test_crops_stand_for_a_picture_whose_last_trial_cannot_see_it_whole(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

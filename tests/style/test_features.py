@@ -136,7 +136,7 @@ def test_wrong_pictures(features: SteerableFeatures, picture: object, error: typ
 # ---- what it is blind to, and what it sees -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["strokes", "mosaic"])
+@pytest.mark.parametrize("name", ["strokes", pytest.param("mosaic", marks=pytest.mark.slow)])
 def test_blind_to_place_not_to_texture(name: str):
     style = painting(name, size=256)
     loss = StyleLoss(style, colour=0, content=0, crop=256)
