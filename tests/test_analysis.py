@@ -70,7 +70,7 @@ def test_a_clipped_edge_is_refused() -> None:
 
 
 @pytest.mark.parametrize("fill_factor", [1.0, 0.5])
-@pytest.mark.parametrize("f_number", [2.8, 5.6])
+@pytest.mark.parametrize("f_number", [pytest.param(2.8, marks=pytest.mark.slow), 5.6])
 def test_a_thin_lens_has_the_mtf_of_diffraction_and_pixel(f_number: float, fill_factor: float) -> None:
     lens = optics.Lens(
         optics.CircularAperture(10 * mm / f_number), optics.ThinLens(focal_length=10 * mm), focus_distance=2.0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import functools
+import json
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -61,6 +63,12 @@ FORBIDDEN = {"colour", "colour_demosaicing", "cv2", "h5py", "mpmath", "zarr"}
 LAZY = {"kcam.data": {"h5py", "cv2", "zarr"}, "kcam.optics": {"h5py"}}
 
 
+@functools.cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """All of a file, parsed once: every test below asks for it."""
+    return tuple(ast.walk(ast.parse(path.read_text())))
+
+
 def part(path: Path) -> str:
     """kcam/optics/psf.py -> kcam.optics; kcam/camera.py -> kcam.camera."""
     return f"kcam.{path.relative_to(PACKAGE).parts[0].removesuffix('.py')}"
@@ -71,15 +79,14 @@ def imports(path: Path, *, members: bool = False) -> list[tuple[str, bool]]:
 
     members: every `from a import b` as a.b, which may be a module too.
     """
-    tree = ast.parse(path.read_text())
     typing_only = {
         id(node)
-        for block in ast.walk(tree)
+        for block in nodes(path)
         if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
         for node in ast.walk(block)
     }
     found = []
-    for node in ast.walk(tree):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found += [(alias.name, id(node) in typing_only) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -142,15 +149,14 @@ def test_imports_inside_data_point_upstream(path: Path) -> None:
 
 
 def test_nothing_outside_calls_a_private_name_of_optics() -> None:
-    trees = {path: ast.parse(path.read_text()) for path in FILES}
     inside = {path for path in FILES if path.is_relative_to(PACKAGE / "optics")}
-    nodes = [node for path in inside for node in ast.walk(trees[path])]
-    private = {node.name for node in nodes if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
-    private |= {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    ours = [node for path in inside for node in nodes(path)]
+    private = {node.name for node in ours if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
+    private |= {node.attr for node in ours if isinstance(node, ast.Attribute)}
     private = {name for name in private if name.startswith("_") and not name.startswith("__")}
     assert len(private) > 100
     for path in set(FILES) - inside:
-        for node in ast.walk(trees[path]):
+        for node in nodes(path):
             if isinstance(node, ast.Attribute) and node.attr in private:
                 assert ast.unparse(node.value) in ("self", "cls"), f"{path.name}:{node.lineno}: {ast.unparse(node)}"
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("kcam.optics"):
@@ -165,7 +171,7 @@ def test_only_core_dependencies(path: Path) -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=IDS)
 def test_no_print_no_assert_no_bare_raise(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         where = f"{path.name}:{getattr(node, 'lineno', 0)}"
         assert not isinstance(node, ast.Assert), f"{where}: raise an error that says what was expected"
         if isinstance(node, ast.Call):
@@ -177,30 +183,48 @@ def test_no_print_no_assert_no_bare_raise(path: Path) -> None:
             assert abstract or not (bare and name[:1].isupper()), f"{where}: {name} without a message"
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import kcam, kcam.augmentation, kcam.data, kcam.style",
-        "import kcam; kcam.Camera.phone()(kcam.Scene.builtin('star', 32))",
-        "import kcam; kcam.Camera.preset('slr')[0](kcam.Scene.builtin('star', 32))",
+COMPILER = ("torch._dynamo", "torch._inductor", "sympy", "matplotlib", "cv2", "h5py", "colour")
+SCIPY = ("interpolate", "optimize", "spatial", "ndimage", "sparse", "special")
+STEPS = {
+    "kcam": ("import kcam", [f"scipy.{name}" for name in SCIPY]),
+    "command": ("import kcam.cli", ["kcam.data", "kcam.style", "matplotlib", "tifffile"]),
+    "import": ("import kcam, kcam.augmentation, kcam.data, kcam.style", COMPILER),
+    "picture": ("kcam.Camera.phone()(kcam.Scene.builtin('star', 32))", COMPILER),
+    "picture over the field": ("kcam.Camera.preset('slr')[0](kcam.Scene.builtin('star', 32))", COMPILER),
+    "augmentation": (
         "import kcam.augmentation as KC, torch; KC.RandomDefocus(p=1.0)(torch.rand(1, 3, 24, 24))",
-    ],
-    ids=["import", "picture", "picture over the field", "augmentation"],
-)
-def test_nothing_that_is_not_compiled_waits_for_the_compiler(code: str) -> None:
+        COMPILER,
+    ),
+}
+"""What is done, and what it leaves for later."""
+
+
+@pytest.fixture(scope="module")
+def loaded() -> dict[str, list[str]]:
+    """After each step, of what it should leave for later, what is there. What is loaded stays so: one process, which
+    takes seconds to begin, does all of them.
+    """
+    code = ["import json, sys", "found = {}"]
+    for name, (line, late) in STEPS.items():
+        code += [line, f"found[{name!r}] = [name for name in {list(late)} if name in sys.modules]"]
+    code.append("print(json.dumps(found))")
+    done = subprocess.run([sys.executable, "-c", "\n".join(code)], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("step", [name for name, (_, late) in STEPS.items() if late is COMPILER])
+def test_nothing_that_is_not_compiled_waits_for_the_compiler(step: str, loaded: dict[str, list[str]]) -> None:
     """torch._dynamo takes 2 s to import, and torch.compiler's own decorators do so."""
-    late = ("torch._dynamo", "torch._inductor", "sympy", "matplotlib", "cv2", "h5py", "colour")
-    code += f"; import sys; print([name for name in {late} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert loaded[step] == []
 
 
-def test_an_import_leaves_scipy_s_parts_for_later() -> None:
+def test_an_import_leaves_scipy_s_parts_for_later(loaded: dict[str, list[str]]) -> None:
     """They come as `scipy.part` when they are used: together they take half a second."""
-    late = ("scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.ndimage", "scipy.sparse", "scipy.special")
-    code = f"import sys, kcam; print([name for name in {late} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert loaded["kcam"] == []
+
+
+def test_the_command_loads_no_more_than_it_must(loaded: dict[str, list[str]]) -> None:
+    assert loaded["command"] == []
 
 
 def test_typed_package_has_one_version() -> None:

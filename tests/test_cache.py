@@ -567,7 +567,7 @@ def walk(seed: int, *, steps: int) -> None:
             look(camera, scene, how)
 
 
-@pytest.mark.parametrize("seed", [100, 105, 110, 120])
+@pytest.mark.parametrize("seed", [100, 110])
 def test_random_changes(seed: int) -> None:
     walk(seed, steps=10)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections.abc import Callable
@@ -132,11 +133,20 @@ def lights() -> Tensor:
 
 
 def made(name: str, dtype: torch.dtype) -> tuple[Camera, Scene, LinearCamera, Draw]:
+    """A case, which no test changes: made once, and with it its PSFs. Each test draws from where the scene left off."""
+    camera, scene, operator, state = _made(name, dtype)
+    draw = Draw(0)
+    draw.generator.set_state(state)
+    return camera, scene, operator, draw
+
+
+@functools.cache
+def _made(name: str, dtype: torch.dtype) -> tuple[Camera, Scene, LinearCamera, Tensor]:
     draw = Draw(len(name))
     case = (CASES | SLOW)[name]
     camera, scene = case.camera(), case.scene(draw).to(dtype)
     with torch.no_grad():
-        return camera, scene, camera.linear(scene), draw
+        return camera, scene, camera.linear(scene), draw.generator.get_state()
 
 
 def signed(draw: Draw, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -263,7 +273,7 @@ def test_light_becomes_a_scene_again() -> None:
 # ---- derivatives --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene_of", [pictured, cube, mapped])
+@pytest.mark.parametrize("scene_of", [pytest.param(pictured, marks=pytest.mark.slow), cube, mapped])
 def test_gradients_reach_light_raw_lens_and_filter(scene_of: Callable[[Draw], Scene]) -> None:
     draw = Draw(5)
     scene = scene_of(draw).crop(top=4, left=5, height=5, width=6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.util
 import json
 import os
@@ -118,7 +119,7 @@ SCRIPTS = [str(path.relative_to(DOCS)) for folder in ("lessons", "recipes", "pic
            sorted((DOCS / folder).glob("plot_*.py"))]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sampled(SCRIPTS, 3))
+@pytest.mark.parametrize("name", sampled(SCRIPTS, 1))
 def test_script_runs(name: str, tmp_path: Path) -> None:
     """As a user would, in a process of its own: warnings are errors."""
     environment = os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
@@ -385,12 +386,17 @@ def quoted_tests() -> list[tuple[str, str]]:
     return sorted(set(links + comments))
 
 
+@functools.cache
+def functions(path: str) -> dict[str, ast.FunctionDef]:
+    """Of a file that many lines quote, parsed once."""
+    nodes = ast.walk(ast.parse((ROOT / path).read_text()))
+    return {node.name: node for node in nodes if isinstance(node, ast.FunctionDef)}
+
+
 def test_every_quoted_test_exists() -> None:
     assert len(quoted_tests()) > 20
     for name, path in quoted_tests():
-        tree = ast.parse((ROOT / path).read_text())
-        names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
-        assert name in names, f"{path} has no {name}"
+        assert name in functions(path), f"{path} has no {name}"
 
 
 def test_every_claim_in_the_two_tables_names_its_test() -> None:
@@ -402,7 +408,7 @@ def test_every_claim_in_the_two_tables_names_its_test() -> None:
 def source_of(name: str, path: str) -> str:
     """A test with its decorators."""
     text = (ROOT / path).read_text()
-    node = next(n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef) and n.name == name)
+    node = functions(path)[name]
     first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
     return "\n".join(text.splitlines()[first - 1 : node.end_lineno])
 

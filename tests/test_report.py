@@ -61,7 +61,9 @@ def disturbed(camera: Camera) -> Camera:
     return camera
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "no stage" else name for name in CAMERAS]
+)
 def test_a_sheet_has_the_panels_that_its_camera_has_and_nothing_overlaps(name: str) -> None:
     make, panels = CAMERAS[name]
     figure = report.style_sheet(make(), style=STYLE, scenes=SCENES, step=7, start=make())

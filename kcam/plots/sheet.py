@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 import os
@@ -100,12 +101,7 @@ def shortened(text: str, width: float, *, size: float = LABEL, weight: str = "no
     >>> plots.shortened("a text that is too long for its place", width=1.0)
     'a text...…'
     """
-    font = FontProperties(size=size, weight=weight)
-
-    def wide(part: str) -> float:
-        part = part.strip().replace("$", "S")  # no formula
-        return 1.06 * TextPath((0, 0), part, prop=font).get_extents().x1 / 72 if part else 0.0  # hinting widens it
-
+    wide = functools.partial(_width, size=size, weight=weight)
     text = " ".join(text.split())[: int(width * 72)]  # a point and more for each letter
     if wide(text) <= width:
         return text
@@ -113,6 +109,14 @@ def shortened(text: str, width: float, *, size: float = LABEL, weight: str = "no
     while kept > 0 and wide(f"{text[:kept]}\u2026") > width:
         kept -= 1
     return f"{text[:kept].rstrip(' ,;')}\u2026"
+
+
+@functools.lru_cache(4096)  # outlines take milliseconds, and figures of several cameras have most captions in common
+def _width(text: str, *, size: float, weight: str) -> float:
+    """Of a text in one line [inches]."""
+    text = text.strip().replace("$", "S")  # no formula
+    font = FontProperties(size=size, weight=weight)
+    return 1.06 * TextPath((0, 0), text, prop=font).get_extents().x1 / 72 if text else 0.0  # hinting widens it
 
 
 def duration(seconds: float) -> str:

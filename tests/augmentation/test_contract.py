@@ -677,10 +677,16 @@ class TestCompile:
     @pytest.mark.parametrize(
         "name",
         [
-            "vignetting",
             *(
-                pytest.param(name, marks=pytest.mark.slow)  # 1 to 6 s each
-                for name in ("exposure", "tone_curve", "white_balance", "lens_distortion", "chromatic_aberration")
+                pytest.param(name, marks=pytest.mark.slow)  # 1 to 6 s each; some rows of vignetting: below
+                for name in (
+                    "vignetting",
+                    "exposure",
+                    "tone_curve",
+                    "white_balance",
+                    "lens_distortion",
+                    "chromatic_aberration",
+                )
             ),
             "defocus",
         ],

@@ -30,7 +30,7 @@ def rms(name: str, severity: int, picture: Tensor) -> float:
     return float((KC.corrupt(picture, name, severity=severity) - picture).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("severity", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("severity", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 4)), 5])
 @pytest.mark.parametrize("name", SOME)
 def test_every_row(name: str, severity: int) -> None:
     for x in (photograph("coffee")[..., :33, :47], photograph("coffee")[0, :, :32, :32].double()):

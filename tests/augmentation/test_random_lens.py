@@ -219,7 +219,9 @@ def test_steps_are_what_is_drawn() -> None:
     assert one["reach"].tolist() == pytest.approx([0.75] * 4)
 
 
-@pytest.mark.parametrize("f_number", [8.0, 16.0, 30.0])
+@pytest.mark.parametrize(
+    "f_number", [pytest.param(8.0, marks=pytest.mark.slow), 16.0, pytest.param(30.0, marks=pytest.mark.slow)]
+)
 def test_a_slow_lens_and_a_small_picture_keep_pixels_within_their_range(f_number: float) -> None:
     """200 wavelengths times the f-number are above a millimetre beyond f/9."""
     front = optics.Surface(radius=52 * mm, thickness=1 * mm, glass="N-BK7", semi_diameter=25 / f_number * mm, stop=True)

@@ -71,7 +71,7 @@ def test_delta_e_has_its_gradient_and_a_finite_one_where_colours_agree_or_are_gr
 
 
 @pytest.mark.parametrize("illuminant", ["D65", "A", "D50"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_errors_reported_are_those_of_colour_science(seed: int, illuminant: str) -> None:
     """Through the stages, by the oracle's own spectra, illuminants and observer."""
     raw, _ = camera_raw(seed, illuminant)
@@ -94,7 +94,7 @@ def test_the_errors_reported_are_those_of_colour_science(seed: int, illuminant: 
 
 
 @pytest.mark.parametrize("illuminant", ["D65", "A", "D50"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
 def test_the_white_of_all_patches_is_that_of_a_perfect_white(seed: int, illuminant: str) -> None:
     raw, white = camera_raw(seed, illuminant, exposure=3.7)
     fit = colour_matrix(torch.from_numpy(raw), illuminant=illuminant)
@@ -190,7 +190,7 @@ def test_black_taken_off_a_saturated_chart_leaves_patches_that_are_seen() -> Non
 
 
 @pytest.mark.parametrize("illuminant", ["D65", "A"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
 def test_red_taken_for_blue_warns(seed: int, illuminant: str) -> None:
     raw = torch.from_numpy(camera_raw(seed, illuminant)[0])
     colour_matrix(raw, illuminant=illuminant)

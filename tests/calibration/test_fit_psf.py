@@ -239,7 +239,7 @@ def test_a_picture_of_a_camera_is_turned_against_the_light() -> None:
     assert fit.values["Z8"] == pytest.approx(-50 * nm, abs=1 * nm)
 
 
-@pytest.mark.parametrize("what", ["diameter", "sensor_distance"])
+@pytest.mark.parametrize("what", ["diameter", pytest.param("sensor_distance", marks=pytest.mark.slow)])
 def test_whatever_trains_is_found(what: str) -> None:
     """Under no_grad, too; the search tries apertures beyond those that are tested, and does not say so."""
     picture = points({}, seed=9, defocus=0.3 * mm)

@@ -17,7 +17,7 @@ import numpy as np
 import tifffile
 import torch
 import typer
-from typer.testing import CliRunner
+from commands import invoke
 
 from kcam.data import Cube, Settings, extract, make_plan, write_cube
 from kcam.units import nm
@@ -46,7 +46,7 @@ def call(name: str, *arguments: object, status: int = 0) -> str:
     """What a tool printed, in this process."""
     app = typer.Typer()
     app.command()(tool(name).main)
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    result = invoke(app, *arguments)
     assert result.exit_code == status, (result.output, result.exception)
     assert "Traceback" not in result.output
     return result.output

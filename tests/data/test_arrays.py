@@ -9,10 +9,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from commands import run
+from commands import invoke, run
 from scipy.io import savemat
-from stores import content, quiet, tool
-from typer.testing import CliRunner
+from stores import content, tool
 from writers import _matlab73, cube
 
 from kcam import cli
@@ -240,7 +239,7 @@ def scenes(folder: Path, axes: str = "wch", names: tuple[str, ...] = ("apple", "
 
 def document(*arguments: object, status: int = 0) -> dict[str, Any]:
     """What a command gives to scripts."""
-    result = CliRunner().invoke(cli.app, ["data", *(str(argument) for argument in arguments)])
+    result = invoke(cli.app, "data", *arguments)
     assert result.exit_code == status, result.output
     return json.loads(result.stdout)
 
@@ -360,9 +359,9 @@ def test_scripts_and_subcommands_give_the_same(wrong: bool, tmp_path: Path, monk
         for command, script, *arguments in calls:
             app = cli.app if place else console.command(tool(script).main)
             words = ["data", command, *arguments] if place else arguments
-            result = CliRunner().invoke(app, [str(word) for word in words])
+            result = invoke(app, *words)
             assert "Traceback" not in result.output
-            kept += [command, result.exit_code, result.stdout, quiet(result.stderr)]
+            kept += [command, result.exit_code, result.stdout, result.stderr]
         kept += [content(Path()), [code for code in kept if isinstance(code, int)]]
     assert results[0] == results[1]
     assert results[0][-1] == ([1, 1, 2, 2, 2, 2, 2] if wrong else [1, 1, 0, 0, 2, 0, 0])

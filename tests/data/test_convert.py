@@ -20,7 +20,7 @@ import stores
 import tifffile
 import typer
 import writers
-from typer.testing import CliRunner
+from commands import invoke
 
 from kcam.cli import console
 from kcam.data import convert as module
@@ -30,7 +30,6 @@ from kcam.data.convert import Conversion, convert
 from kcam.units import nm
 
 TOOLS = Path(__file__).parents[2] / "data_tools"
-runner = CliRunner()
 
 
 def tool(name: str):
@@ -47,7 +46,7 @@ def tool(name: str):
 
 
 def run(name: str, *arguments: object, status: int = 0):
-    result = runner.invoke(tool(name), [str(argument) for argument in arguments])
+    result = invoke(tool(name), *arguments)
     assert result.exit_code == status, result.output
     assert "Traceback" not in result.output
     return result
@@ -93,7 +92,7 @@ def test_a_folder_without_scenes_is_a_failure(inside: tuple[str, ...], tmp_path:
 def test_help_prints_what_was_written(name: str) -> None:
     """[m], [pixels] and kcam[dask] are no markup."""
     app = console.command(stores.tool(name).main)
-    printed = CliRunner().invoke(app, ["--help"]).output.replace("\u2502", " ")
+    printed = invoke(app, "--help").output.replace("\u2502", " ")
     command: Any = typer.main.get_command(app)
     for sentence in (command.help, *(getattr(parameter, "help", None) for parameter in command.params)):
         assert "".join((sentence or "").split()) in "".join(printed.split())

@@ -157,7 +157,9 @@ class TestContract:
         result = isp.demosaic(mosaic(image, pattern="odd"), pattern="odd", method=method)
         torch.testing.assert_close(result, image.contiguous())
 
-    @pytest.mark.parametrize("method", ["malvar", "difference", "bilinear"])
+    @pytest.mark.parametrize(
+        "method", ["malvar", *(pytest.param(name, marks=pytest.mark.slow) for name in ("difference", "bilinear"))]
+    )
     def test_compile_fullgraph(self, method: str) -> None:
         def call(raw: Tensor, gains: Tensor) -> Tensor:
             return isp.demosaic(raw, pattern="GRBG", method=method, gains=gains)

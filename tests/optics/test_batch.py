@@ -80,7 +80,7 @@ def test_gradients_to_every_drawn_number() -> None:
 
 
 @pytest.mark.parametrize("f_number", [1.8, 8, 32])
-@pytest.mark.parametrize("shape", [(41, 40), (64, 31)])
+@pytest.mark.parametrize("shape", [(41, 40), pytest.param((64, 31), marks=pytest.mark.slow)])
 def test_without_aberrations_one_hankel_transform_gives_the_same(f_number: float, shape: tuple[int, int]) -> None:
     """Against the matrix form, good to 5e-5; a fringe is much smaller than a pixel at f/1.8, larger at f/32."""
     vergences = torch.tensor([[0.0, 1.5], [-0.7, 4.0]], dtype=torch.float64)

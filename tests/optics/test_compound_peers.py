@@ -52,7 +52,10 @@ def test_chief_rays_land_where_optiland_has_them(name: str, line: int) -> None:
     assert np.abs(landed.numpy() - recorded()[f"{name} chief"][line]).max() < 1e-13  # m; 1e-10 mm
 
 
-@pytest.mark.parametrize(("name", "line"), CASES)
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [pytest.param(*case.values, marks=case.marks if "phone" in case.values else pytest.mark.slow) for case in CASES],
+)
 def test_the_same_share_of_the_stop_passes(name: str, line: int) -> None:
     wavelength = goldens.WAVELENGTHS[line]
     lens = goldens.at_wavelength(name, wavelength)

@@ -87,7 +87,7 @@ def between_layers(seed: int, kind: str) -> tuple[float, float]:
 BETWEEN = {"noise": (0.01, 0.02), "point": (0.08, 0.10), "lamp": (0.02, 0.025)}
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", BETWEEN)
 def test_light_between_two_layers(kind: str, seed: int) -> None:
     """At worst, midway, of the largest value: noise, a lone point, and a lamp, which has layers half as far apart."""
@@ -299,7 +299,7 @@ def check_coverage(seed: int, lens: str) -> None:
     assert error < COVERAGE[lens]
 
 
-@pytest.mark.parametrize("seed", QUICK)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in QUICK[1:])])
 @pytest.mark.parametrize("lens", COVERAGE)
 def test_colours_that_hide_colours(lens: str, seed: int) -> None:
     """Per band it is the picture of all bands, filtered; per channel it is off by what a lens's own colours do."""

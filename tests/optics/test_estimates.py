@@ -109,7 +109,7 @@ def judge(seeds: range) -> None:
 
 
 def test_estimates_hold_over_random_cameras() -> None:
-    judge(range(3))
+    judge(range(1, 4))  # rotationally symmetric ones and one that is not, of a second together; 0 takes four
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_estimates_hold_for_maps_however_the_rim_cuts_them(
 
 
 @pytest.mark.parametrize("samples", [96, 128, 192, 400])
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
+@pytest.mark.parametrize("seed", [*(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3)), 3])
 def test_estimates_hold_for_samples_that_the_user_gives(seed: int, samples: int) -> None:
     asked = random_query(seed)
     row = PROPAGATORS["nonparaxial", "matrix"]

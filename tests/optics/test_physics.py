@@ -275,7 +275,7 @@ def zernike_truth() -> Callable[[float], np.ndarray]:
     [
         ("matrix", 550 * nm),
         ("chirp_z", 550 * nm),
-        ("matrix", 450 * nm),  # n is constant here: the same path, more waves
+        pytest.param("matrix", 450 * nm, marks=pytest.mark.slow),  # n is constant here: the same path, more waves
         pytest.param("fft", 550 * nm, marks=pytest.mark.slow),  # its grid must also hold all the light that it folds
     ],
 )
@@ -312,7 +312,7 @@ def test_a_radial_doe_is_the_same_by_all_transforms_and_by_quadrature() -> None:
 # ---- beyond the paraxial model -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("distance", [2.0, 0.5])
+@pytest.mark.parametrize("distance", [pytest.param(2.0, marks=pytest.mark.slow), 0.5])
 @pytest.mark.parametrize(
     ("diameter", "bound"),
     [(5 * mm, 1e-3), (10 * mm, 1e-2)],  # Done-when 2: f/10 and f/5

@@ -112,7 +112,13 @@ def test_the_angular_spectrum_is_centred_and_near(points: int, shape: tuple[int,
     assert l1(textbook_angular_spectrum_row(points=points)(asked), truth) < 0.05
 
 
-@pytest.mark.parametrize("aperture", [optics.SquareAperture(2 * mm), optics.AnnularAperture(2 * mm, obscuration=0.4)])
+@pytest.mark.parametrize(
+    "aperture",
+    [
+        pytest.param(optics.SquareAperture(2 * mm), marks=pytest.mark.slow),
+        optics.AnnularAperture(2 * mm, obscuration=0.4),
+    ],
+)
 def test_every_aperture(aperture: optics.Element) -> None:
     own = optics.Lens(aperture, optics.ThinLens(focal_length=50 * mm), focus_distance=2.0)
     asked = query(own, distances=1.0)

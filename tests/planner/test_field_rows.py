@@ -76,7 +76,10 @@ def test_a_centred_subject_needs_one_psf_and_a_star_field_many() -> None:
     assert plan.apply(shot)[0].relative_illumination is plan.changes.get("relative_illumination", True)
 
 
-@pytest.mark.parametrize(("name", "pitch", "seed"), [("wide_angle", 10 * um, 1), ("cooke_triplet", 8 * um, 2)])
+@pytest.mark.parametrize(
+    ("name", "pitch", "seed"),
+    [pytest.param("wide_angle", 10 * um, 1, marks=pytest.mark.slow), ("cooke_triplet", 8 * um, 2)],
+)
 def test_plans_over_the_field_are_inside_their_tolerance(name: str, pitch: float, seed: int) -> None:
     shot, light = camera(name, pitch), stars(seed=seed)
     with torch.no_grad():

@@ -58,7 +58,8 @@ def choice(plan: Plan, effect: str) -> str:
     return next(row.chosen for row in plan.decisions if row.effect == effect)
 
 
-ADVERSARIAL = (1, 8, 9, 13, 30, 37)  # of each kind of optics
+ADVERSARIAL = (8, 9, 13, 37, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 30)))
+"""Of each kind of optics; those over the field are test_field_rows' among the quick tests."""
 
 
 # ---- honesty -------------------------------------------------------------------------------------------------------
@@ -206,7 +207,7 @@ def test_adversarial_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> 
     assert_inside(shot, light, (0.1, 0.01, 0.001), text)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 3])
 def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,7 +235,7 @@ def test_a_batch_is_tried_with_the_items_whose_light_or_distance_no_other_has(
     assert_inside(shot, light, (0.05, 0.02, 0.005))
 
 
-@pytest.mark.parametrize("seed", [30, 31])
+@pytest.mark.parametrize("seed", [30, pytest.param(31, marks=pytest.mark.slow)])
 def test_crops_stand_for_a_picture_whose_last_trial_cannot_see_it_whole(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

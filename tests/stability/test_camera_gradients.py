@@ -17,7 +17,7 @@ from kcam import Camera, Scene, isp, optics, sensor
 from kcam.units import mm, nm, um
 
 COUNT = 20
-FAST = 4  # of them in `make test`; a camera takes a second
+FAST = 2  # of them in `make test`; a camera takes a second
 PATTERNS = ("RGGB", "x_trans", "BGGR", "quad_bayer")
 # Steps of the differences, in the parameter's own unit. The five-point formula errs by h^4 f'''''/30: 1e-3 of a radian
 # or of full scale leaves 1e-12 of a curve that turns over one of them; the lengths turn the rim's path by 1e-3 rad.

@@ -7,7 +7,7 @@ import torch
 from cases import BAD_CASES, CASES, ITEMS, NAMES
 from contract import DOUBLE, SINGLE, BadCase, Case, photograph, relative
 
-QUICK = 2  # of so many cases, one runs among the quick tests
+QUICK = 3  # of so many cases, one runs among the quick tests
 ROWS = [
     pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.slow or index % QUICK else [])
     for index, case in enumerate(CASES)

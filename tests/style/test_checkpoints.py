@@ -379,8 +379,17 @@ SITUATIONS = {
 }
 
 
-@pytest.mark.parametrize("how", ["before", "after", "power cut before", "power cut after"])
-@pytest.mark.parametrize("situation", SITUATIONS)
+HOW = ("before", "after", "power cut before", "power cut after")
+
+
+@pytest.mark.parametrize(
+    ("situation", "how"),
+    [  # of each way two or three situations, and of each situation two ways are among the quick tests
+        pytest.param(situation, how, marks=[pytest.mark.slow] if (row + column) % 2 else [])
+        for row, situation in enumerate(SITUATIONS)
+        for column, how in enumerate(HOW)
+    ],
+)
 def test_death_at_every_change_of_the_disk(tmp_path: Path, situation: str, how: str):
     """After each of them the newest is the one before or the new one, never less, and nothing is left over."""
     before, step, keep = SITUATIONS[situation]
