@@ -191,6 +191,18 @@ def gaps(pictures: dict[str, Tensor], *, style: str) -> dict[str, Any]:
     return {"photographs": rows, "mean": mean, "wallpaper": measures.wallpaper(list(pictures.values()))}
 
 
+def seen_of(pictures: dict[str, Tensor], *, style: str) -> dict[str, float]:
+    """What the eye sees of an arm's pictures, the means of the photographs."""
+    own, _ = halves(style)
+    scenes = measures.photographs(SIZE)
+    rows = [
+        measures.seen(picture, scene=scenes[name], style=own, face=measures.FACES.get(name))
+        for name, picture in pictures.items()
+    ]
+    known = {key: [row[key] for row in rows if key in row] for row in rows for key in row}
+    return {key: sum(values) / len(values) for key, values in known.items()}
+
+
 def run(style: str, name: str, work: Path, *, seed: int = 0) -> dict[str, Any]:
     """Train an arm, write its pictures, and measure."""
     arm = ARMS[name]
@@ -260,6 +272,10 @@ def collect(work: Path) -> None:
     rows = list((known | {(row["style"], row["arm"], row["seed"]): row for row in own}).values())
     for row in rows:
         row["note"] = ARMS[row["arm"]].note
+        folder = folder_of(row["style"], row["arm"], work, seed=row["seed"])
+        if folder.is_dir():
+            pictures = {name: read_picture(folder / f"{name}.png") for name in measures.photographs(SIZE)}
+            row["seen"] = seen_of(pictures, style=row["style"])
     order = {name: index for index, name in enumerate(ARMS)}
     rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]], row["seed"]))
     write_json(RESULT, {"environment": environment(), "rows": rows})

@@ -821,6 +821,26 @@ def style_table(which: str, **columns: str) -> str:
     return "\n".join((head, "|---" * (len(columns) + len(STYLE_MEASURES) + 2) + "|", *runs))
 
 
+SEEN = {
+    "stroke_length": "stroke length",
+    "along_across": "along / across",
+    "pixel_noise": "pixel noise",
+    "coherence": "coherence",
+    "halo": "halo",
+    "face": "face",
+}
+
+
+def seen_table() -> str:
+    """What the eye sees of shots, of those runs whose pictures it was measured on."""
+    lines = ["| style | seed | " + " | ".join(SEEN.values()) + " |", "|---" * (len(SEEN) + 2) + "|"]
+    for row in json.loads((RESULTS / "style.json").read_text())["rows"]:
+        if "seen" in row:
+            values = " | ".join(f"{row['seen'][key]:.2f}" for key in SEEN)
+            lines.append(f"| {row['style']} | {row['seed']} | {values} |")
+    return "\n".join(lines)
+
+
 # ---- the reference ---------------------------------------------------------------------------------------------------
 
 
@@ -896,6 +916,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "style": lambda: style_table("ours", style="style", note="what trains"),
     "seeds": lambda: style_table("seeds", style="style", note="what trains", seed="seed"),
     "whole": lambda: style_table("whole", style="style"),
+    "seen": seen_table,
     "thesis": lambda: style_table("thesis", note="arrangement", style="style"),
     "propagators": propagators_table,
     "tradeoff": tradeoff_table,

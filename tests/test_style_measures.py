@@ -249,3 +249,59 @@ def test_a_blend_needs_a_style_that_covers_the_photograph(gravel):
     assert torch.equal(measures.blend(torch.zeros(3, 64, 70), gravel), gravel[:, :64, :70] / 2)
     with pytest.raises(ValueError, match=r"\(3, 60, 512\) must cover the photograph \(3, 64, 64\)"):
         measures.blend(torch.zeros(3, 64, 64), gravel[:, :60])
+
+
+def waves(width: float = 6.0, *, length: float = 1000.0) -> Tensor:
+    """Level strokes of even colours by chance, of a width and a length [pixel]."""
+    rows, columns = torch.arange(SIDE), torch.arange(SIDE)
+    row = (rows // width).long()
+    start = (length * noise(int(row.max()) + 1, seed=1))[row]
+    column = ((columns + start[:, None]) // length).long()
+    return noise(int(row.max()) + 1, int(column.max()) + 1, 3, seed=2)[row[:, None], column].permute(2, 0, 1)
+
+
+def test_strokes_that_are_broken_are_shorter() -> None:
+    lengths = [measures.stroke_length(waves(length=length)) for length in (12.0, 24.0, 1000.0)]
+    assert lengths[0] < lengths[1] < lengths[2]
+    assert 5 < lengths[0] < 16  # the mean over places within a stroke of how far both its ends are: its own length
+    contrast = measures.stroke_length(0.5 + (waves(length=24.0) - 0.5) / 4)
+    assert contrast == pytest.approx(lengths[1], rel=0.05)  # contrast does not count
+
+
+def test_a_stroke_has_one_colour_along_and_many_across() -> None:
+    assert measures.along_across(waves()) < 0.2
+    assert measures.along_across(noise(3, SIDE, SIDE)) > 0.7
+    assert measures.along_across(waves(length=12.0)) > 2 * measures.along_across(waves())
+
+
+def test_mazes_are_finer_than_strokes(gravel: Tensor) -> None:
+    own = gravel[:, :SIDE, :SIDE]
+    noisy = (own + 0.1 * (noise(1, SIDE, SIDE) - 0.5)).clamp(0, 1)
+    assert measures.pixel_noise(blurred(own, 1.0)) < measures.pixel_noise(own) < measures.pixel_noise(noisy)
+
+
+def test_coherence_tells_directed_from_mottled(gravel: Tensor) -> None:
+    assert measures.coherence(waves(), gravel) > 4 * measures.coherence(gravel[:, :SIDE, :SIDE], gravel[:, -SIDE:])
+
+
+def test_a_halo_is_an_overshoot_beside_steps() -> None:
+    for photo in measures.photographs(256).values():
+        sharper = (photo + (photo - blurred(photo, 6))).clamp(0, 1)
+        assert abs(measures.halo(photo, photo)) < 0.06
+        assert measures.halo(sharper, photo) > measures.halo(photo, photo) + 0.03
+
+
+def test_a_face_is_looked_for_in_its_box(photographs) -> None:
+    hopper, box = photographs["hopper"], measures.FACES["hopper"]
+    top, bottom, left, right = (round(SIDE * share) for share in box)
+    without = hopper.clone()
+    without[:, top:bottom, left:right] = noise(3, bottom - top, right - left)
+    assert abs(measures.face_correlation(without, hopper, box)) < 0.3
+    assert measures.detail_correlation(without, hopper) > 0.4
+    assert measures.face_correlation(hopper, hopper, box) == pytest.approx(1)
+
+
+def test_the_style_s_own_is_one(gravel: Tensor, photographs) -> None:
+    found = measures.seen(gravel[:, :SIDE, :SIDE], scene=photographs["hopper"], style=gravel[:, :SIDE, :SIDE])
+    assert found["stroke_length"] == found["along_across"] == found["pixel_noise"] == 1
+    assert found["coherence"] == 0

@@ -5,8 +5,9 @@
 
 e is what the exemplar shows, f what is compared of it, g what is asked for. Neighbours whose places are neighbours too
 cost nothing: the exemplar goes on as it is, and pieces grow; where two meet, the sum asks that each would show what the
-other does, and something that they meet at all. The least is looked for from an eighth of the size on, pixel by pixel, among places that neighbours, chance
-and small steps suggest. What only a few pixels would gain by changing together is found at the coarser levels.
+other does, and j for meeting at all. The least is looked for from an eighth of the size on, pixel by pixel, among
+places that neighbours, chance and small steps suggest. What only a few pixels would gain by changing together is found
+at the coarser levels.
 """
 
 from __future__ import annotations

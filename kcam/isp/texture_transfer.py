@@ -160,7 +160,7 @@ class _Exemplar:
 
 
 def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.Generator) -> tuple[Tensor, ...]:
-    """Of a picture (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (1,H,W)."""
+    """Of (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (1,H,W)."""
     luma = _luma(picture)
     fine, wide = (part[None] for part in _tones(luma))
     spread = fine.std(correction=0) + 1e-4
