@@ -22,7 +22,7 @@ from kcam.camera import PAINTING, Camera
 from kcam.inputs import named
 from kcam.plain import from_json
 from kcam.scene import Scene, read_picture
-from kcam.style.processes import place, told_by_the_first
+from kcam.style.processes import joined, place, told_by_the_first
 from kcam.threads import fixed, free_cores
 
 fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
@@ -122,7 +122,7 @@ def run(
         for line in named("skipped", source.skipped):
             say(line)
     with ExitStack() as stack:
-        leads, device = stack.enter_context(_processes(options.device))
+        leads, device = stack.enter_context(joined(options.device))
         document["threads"] = told_by_the_first(_threads(folder, resume, threads), place()[1])
         stack.enter_context(fixed(document["threads"]))
         if leads:  # the others would meet what this one has begun to write
@@ -306,22 +306,6 @@ def _threads(folder: Path, resume: bool, threads: int | None) -> int:
             raise ValueError(f"threads must be at least 1, got {threads}.")
         return threads
     return max(1, free_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
-
-
-@contextmanager
-def _processes(device: str) -> Iterator[tuple[bool, torch.device]]:
-    """Whether this process leads, and its device; under torchrun the others are joined."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        yield True, torch.device(device)
-        return
-    own = torch.device(device, int(os.environ["LOCAL_RANK"])) if device == "cuda" else torch.device(device)
-    if device == "cuda":
-        torch.cuda.set_device(own)  # else every process's flags and objects would go by the first one
-    torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
-    try:
-        yield torch.distributed.get_rank() == 0, own
-    finally:
-        torch.distributed.destroy_process_group()
 
 
 @contextmanager

@@ -34,6 +34,7 @@ import os
 import sys
 
 import torch
+import torch.distributed.nn.functional  # first: imported later, as Adam does, its defaults hold the group for ever
 from torch import distributed
 
 from kcam import Camera, Scene, isp, optics, sensor
@@ -128,8 +129,9 @@ ax.legend(frameon=False)
 
 # %%
 # ``torch.nn.parallel.DistributedDataParallel(camera)`` averages the gradients too, while the backward pass still runs,
-# which pays on GPUs. On a CPU the threads of ``gloo`` that it started run on until the process ends (torch 2.13), and
-# one run of this page was aborted there; those of the loop above end with ``destroy_process_group``.
+# which pays on GPUs. On a CPU mind the threads of ``gloo``: ``destroy_process_group`` ends them only when nothing else
+# holds the group. One that still lets go of a tensor while Python ends aborts the process ("terminate called without an
+# active exception", torch 2.13), one run in ten of this script before its third import stood there.
 #
 # The first loss is the same to rounding. After that rounding may grow: a sum in another order differs in its last bit,
 # and then somewhere a photon more or less is counted, which is a step and no rounding.

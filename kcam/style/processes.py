@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import importlib
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
+
+
+@contextmanager
+def joined(device: str) -> Iterator[tuple[bool, torch.device]]:
+    """Whether this process leads, and its device; under torchrun with the others, until the end of the context."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield True, torch.device(device)
+        return
+    own = torch.device(device, int(os.environ["LOCAL_RANK"])) if device == "cuda" else torch.device(device)
+    if device == "cuda":
+        torch.cuda.set_device(own)  # else every process's flags and objects would go by the first one
+    # Imported later, as Adam does, its defaults hold the group and its threads for ever (torch 2.13), and a thread that
+    # lets go of a tensor while Python ends aborts the process.
+    importlib.import_module("torch.distributed.nn.functional")
+    torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+    try:
+        yield torch.distributed.get_rank() == 0, own
+    finally:
+        torch.distributed.destroy_process_group()
 
 
 def place() -> tuple[int, int]:
