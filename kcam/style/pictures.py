@@ -59,10 +59,10 @@ GLAZES = (  # each pigment's share of the picture; the two of a row, which would
 )  # fmt: skip
 SPLASHES = 1 / 900  # drops to a pixel
 
-GROVE, CROWN = 86.0, 42.0  # pixels from grove to grove, and from crown to crown
+GROVE, CROWN, BLOOM = 88.0, 42.0, 0.26  # pixels from grove to grove, from crown to crown; share of trees in bloom
 CAST, RIPPLE = 11, (1.6, 11.0)  # pixels: how far trees cast shade, right and down; a ripple (sigma), down and right
 DOT, CELL, ROUNDS = (4.2, 6.8), 12, 16  # pixels across; pixels between dots of one of the rounds, the largest first
-MIXED, STREWN = 0.11, 0.13  # spread of the dots' light about their place's; share of the complement in the shade
+MIXED, STREWN = 0.10, 0.11  # spread of the dots' light about their place's; share of the complement in the shade
 PRIMER = "#f6ecd6"
 SCENE = (  # the height from which it begins; the complement strewn into its shade; its pigments, from shade to light
     (0.00, "#f4a968", ("#20308c", "#3449ae", "#2f6cc4", "#4192d4", "#62b2dc", "#93d0dc", "#d3e6d2")),  # water
@@ -297,8 +297,8 @@ def _islands(shape: tuple[int, int], rng: Generator) -> tuple[Array, Array]:
     ripples = gaussian_filter(rng.standard_normal(shape), RIPPLE, mode="wrap")
     sparkle = fields.ranks(ripples / ripples.std() + 0.9 * cloud(GROVE / 2) - 2.5 * cast)
     light = np.where(water, sparkle, 0.72 + 0.1 * cloud(CROWN) - 0.6 * cast)
-    light = np.where(trees, fields.ranks(np.add(*fields.gradient(6 * height + 0.5 * cloud(CROWN)))), light)
-    return np.where(trees & (fields.ranks(cloud(CROWN)) > 0.66), 4, matter), light
+    light = np.where(trees, fields.ranks(np.add(*fields.gradient(6 * height + 0.4 * cloud(CROWN)))), light)
+    return np.where(trees & (fields.ranks(cloud(1.5 * CROWN)) > 1 - BLOOM), 4, matter), light
 
 
 def _dots(shape: tuple[int, int], phase: tuple[int, int], turn: float, rng: Generator) -> tuple[Array, ...]:
@@ -319,7 +319,7 @@ def _dots(shape: tuple[int, int], phase: tuple[int, int], turn: float, rng: Gene
 
 
 def hatching(shape: tuple[int, int], rng: Generator) -> Array:
-    """Strokes of the pen along folds, crossed in the shade: a study of drapery in ink on laid paper, after Duerer."""
+    """Strokes of the pen along folds, crossed in the shade: a study of drapery in ink on laid paper, after Dürer."""
     cloud = partial(fields.noise, shape, rng)
     folds = cloud(FOLD), cloud(FOLD)
     front = np.argmax(folds, axis=0)
@@ -355,7 +355,7 @@ def _hatch(tangent: Array, strength: Array, front: Array, gap: float, shade: Arr
     middles = rng.permutation(strength.size)[: round(3 * strength.size / gap**2)]
     middles = middles[strength.flat[middles] > 0]
     places, ways = _traced(tangent, np.stack(np.unravel_index(middles, shape)) + 0.5)
-    pixels = places.astype(int) % np.array(shape)[:, None, None]
+    pixels = np.floor(places).astype(int) % np.array(shape)[:, None, None]
     straight = abs(np.sum(ways * ways[:, :, [HALF]], axis=0)) > 0.6
     clear = straight & (strength[*pixels] > 0) & (front[*pixels] == front[*pixels[:, :, [HALF]]])
     disc = np.mgrid[-4:5, -4:5].reshape(2, -1)
@@ -391,11 +391,11 @@ def _traced(tangent: Array, middles: Array) -> tuple[Array, Array]:
     side = np.array(tangent.shape[1:])[:, None]
     halves = []
     for sense in (-1, 1):
-        place, way, half = middles, sense * tangent[::-1, *middles.astype(int)], []
+        place, way, half = middles, sense * tangent[::-1, *np.floor(middles).astype(int)], []
         for _ in range(HALF + 1):
             half.append((place, sense * way))
             place = place + way
-            line = tangent[::-1, *(place.astype(int) % side)]
+            line = tangent[::-1, *(np.floor(place).astype(int) % side)]
             way = line * np.copysign(1, np.sum(line * way, axis=0))
         halves.append(half)
     path = np.array(halves[0][:0:-1] + halves[1])
