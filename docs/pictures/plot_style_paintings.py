@@ -14,10 +14,10 @@ import matplotlib.pyplot as plt
 from kcam import plots
 from kcam.style import STYLES, painting
 
-fig, axes = plt.subplots(2, 2, figsize=(7, 7.2), layout="constrained")
+fig, axes = plt.subplots(2, 3, figsize=(10.5, 7.2), layout="constrained")
 for ax, name in zip(axes.flat, STYLES, strict=True):
     ax.imshow(plots.as_image(painting(name, size=256, seed=1)))
     ax.set_title(name)
     ax.axis("off")
-fig.suptitle("Four styles, painted by seed")
+fig.suptitle("Six styles, painted by seed")
 plt.show()

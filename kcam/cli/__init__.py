@@ -403,7 +403,10 @@ def _is_doe(part: object) -> bool:
 
 @app.command()
 def train(
-    style: Annotated[str, typer.Argument(help="a picture, or strokes, mosaic, woodcut, watercolour: kcam's own")],
+    style: Annotated[
+        str,
+        typer.Argument(help="a picture, or strokes, mosaic, woodcut, watercolour, pointillism, hatching: kcam's own"),
+    ],
     out: Annotated[Path, typer.Option("--out", help="the camera to write; its run's folder stands beside it")] = Path(
         "styled.safetensors"
     ),
@@ -489,7 +492,8 @@ def train(
 def paint(
     photo: Annotated[str, typer.Argument(help="what the picture shows; without one, a texture of the style")] = "",
     style: Annotated[
-        str, typer.Option("--style", help="a picture, or strokes, mosaic, woodcut, watercolour")
+        str,
+        typer.Option("--style", help="a picture, or strokes, mosaic, woodcut, watercolour, pointillism, hatching"),
     ] = "strokes",
     out: Annotated[Path, typer.Option("--out", help="the picture to write")] = Path("painted.png"),
     by: Annotated[

@@ -1,7 +1,7 @@
 """Style pictures that kcam paints itself: nothing to download, nobody's copyright, the same bytes for the same seed.
 
 Strokes, tiles, lines and blotches keep their size in pixels whatever the picture's size, and any 256-pixel crop looks
-like any other, so that the statistics of a style mean something. All four wrap around at their borders.
+like any other, so that the statistics of a style mean something. All six wrap around at their borders.
 """
 
 from __future__ import annotations
@@ -58,6 +58,25 @@ GLAZES = (  # each pigment's share of the picture; the two of a row, which would
     (0.20, "#e0527f", "#62a66c"), (0.13, "#7648ab", "#2f8577"),
 )  # fmt: skip
 SPLASHES = 1 / 900  # drops to a pixel
+
+GROVE, CROWN, BLOOM = 88.0, 42.0, 0.26  # pixels from grove to grove, from crown to crown; share of trees in bloom
+CAST, RIPPLE = 11, (1.6, 11.0)  # pixels: how far trees cast shade, right and down; a ripple (sigma), down and right
+DOT, CELL, ROUNDS = (4.2, 6.8), 12, 16  # pixels across; pixels between dots of one of the rounds, the largest first
+MIXED, STREWN = 0.10, 0.11  # spread of the dots' light about their place's; share of the complement in the shade
+PRIMER = "#f6ecd6"
+SCENE = (  # the height from which it begins; the complement strewn into its shade; its pigments, from shade to light
+    (0.00, "#f4a968", ("#20308c", "#3449ae", "#2f6cc4", "#4192d4", "#62b2dc", "#93d0dc", "#d3e6d2")),  # water
+    (0.36, "#5a62c4", ("#8a5fb0", "#c286b8", "#f0a58c", "#f8c48c", "#fbdc9c", "#fbeab8", "#fdf3d2")),  # sand
+    (0.46, "#c23a5a", ("#2a3d94", "#1f7a58", "#4da04a", "#8fbf3f", "#c3d34b", "#efe063", "#f9ec9c")),  # a lawn
+    (0.66, "#c92f49", ("#22286f", "#1b4a6e", "#17684c", "#2f8c45", "#6aab3b", "#b3c93f", "#f4df58")),  # trees
+    (1.00, "#1f8a70", ("#4a2478", "#8a2470", "#c4304f", "#e4573f", "#f08a3e", "#f7b25a", "#fbdc9a")),  # some in bloom
+)
+
+FOLD, EVEN = 100.0, 12.0  # pixels from one fold to the next, and (sigma) over which strokes agree on a direction
+HALF, SHORTEST = 22, 9  # pixels from a stroke's middle to its ends, at most; of the shortest stroke
+PEN, TREMBLE, OUTLINED = (0.9, 2.1), 0.35, 1.6  # pixels: wide in light and in shade; off the line; of the creases
+HATCHES = ((0.30, 0.0, 3.9), (0.55, 0.85, 3.9), (0.77, -0.75, 3.6))  # shade to begin at, turn [rad], gap [pixels]
+LAID, GALL = "#f3dfb2", "#1a2142"
 
 
 def painting(name: str, *, size: int | tuple[int, int] = 512, seed: int = 0) -> Tensor:
@@ -249,6 +268,140 @@ def _splashes(shape: tuple[int, int], rng: Generator) -> Array:
     return cover
 
 
+def pointillism(shape: tuple[int, int], rng: Generator) -> Array:
+    """Dots of nearly pure colours that mix in the eye: islands in the Seine on a Sunday, after Seurat."""
+    matter, light = _islands(shape, rng)
+    pigments = np.array([[fields.rgb(code) for code in (strewn, *codes)] for _, strewn, codes in SCENE])
+    steps = pigments.shape[1] - 1
+    picture, relief = np.broadcast_to(fields.rgb(PRIMER), (*shape, 3)).copy(), np.zeros(shape)
+    for turn, phase in enumerate(rng.permutation(ROUNDS)):
+        rows, columns, cover = _dots(shape, divmod(phase, 4), turn / (ROUNDS - 1), rng)
+        middle = rows[:, CELL // 3], columns[:, CELL // 3]
+        count, lit = len(rows), light[middle]
+        pigment = 1 + np.clip(steps * (lit + rng.normal(0, MIXED, count)), 0, steps - 1).astype(int)
+        pigment[rng.random(count) < STREWN * np.clip(1.6 - 2 * lit, 0.2, 1)] = 0
+        paint = pigments[matter[middle], pigment] * rng.normal(1, 0.05, (count, 1))
+        boxes = rows[:, :, None], columns[:, None, :]
+        picture[boxes] += cover[..., None] * (paint[:, None, None] - picture[boxes])
+        relief[boxes] += cover * (1.2 * cover - relief[boxes])
+    return _lit(picture, relief)
+
+
+def _islands(shape: tuple[int, int], rng: Generator) -> tuple[Array, Array]:
+    """Each pixel's row of `SCENE`, and its light, 0 to 1: the sun is at the upper left, and trees cast shade."""
+    cloud = partial(fields.noise, shape, rng)
+    height = fields.ranks(cloud(GROVE))
+    matter = fields.ink_index(tuple((start, strewn) for start, strewn, _ in SCENE), height)
+    trees, water = matter == 3, matter == 0
+    cast = gaussian_filter(np.roll(trees, (CAST, CAST), (0, 1)).astype(float), 2.5, mode="wrap")
+    ripples = gaussian_filter(rng.standard_normal(shape), RIPPLE, mode="wrap")
+    sparkle = fields.ranks(ripples / ripples.std() + 0.9 * cloud(GROVE / 2) - 2.5 * cast)
+    light = np.where(water, sparkle, 0.72 + 0.1 * cloud(CROWN) - 0.6 * cast)
+    light = np.where(trees, fields.ranks(np.add(*fields.gradient(6 * height + 0.4 * cloud(CROWN)))), light)
+    return np.where(trees & (fields.ranks(cloud(1.5 * CROWN)) > 1 - BLOOM), 4, matter), light
+
+
+def _dots(shape: tuple[int, int], phase: tuple[int, int], turn: float, rng: Generator) -> tuple[Array, ...]:
+    """Rows, columns and cover of the boxes of one round of dots, of which no two meet: all are painted at once."""
+    grid = [np.arange(n // CELL) * n / (n // CELL) + part * CELL / 4 for n, part in zip(shape, phase, strict=True)]
+    corners = np.stack(np.meshgrid(*grid, indexing="ij"), -1).reshape(-1, 2).astype(int)
+    reach, count = CELL // 3, len(corners)
+    corners = corners + rng.integers(0, CELL - 2 * reach, corners.shape)
+    steps = np.arange(2 * reach + 1)
+    rows, columns = ((corners[:, [axis]] + steps) % shape[axis] for axis in (0, 1))
+    y, x = np.moveaxis(steps - reach + rng.uniform(-0.5, 0.5, (count, 2, 1)), 1, 0)
+    z = x[:, None, :] + 1j * y[:, :, None]
+    distance = abs(z) + 1e-9
+    radius = DOT[1] / 2 - turn * (DOT[1] - DOT[0]) / 2 * rng.uniform(0.5, 1, (count, 1, 1))
+    oval, knob = rng.normal(0, 0.07, (2, count, 1, 1, 2)) @ np.array([1, 1j])
+    edge = radius * (1 + (oval * (z / distance) ** 2 + knob * (z / distance) ** 3).real)
+    return rows, columns, np.clip(edge - distance + 0.5, 0, 1)
+
+
+def hatching(shape: tuple[int, int], rng: Generator) -> Array:
+    """Strokes of the pen along folds, crossed in the shade: a study of drapery in ink on laid paper, after Dürer."""
+    cloud = partial(fields.noise, shape, rng)
+    folds = cloud(FOLD), cloud(FOLD)
+    front = np.argmax(folds, axis=0)
+    tangent = np.where(front, *(_evened(fields.along(fold)) for fold in folds[::-1]))
+    gx, gy = np.where(front, *(fields.gradient(fold) for fold in folds[::-1]))
+    step = folds[1] - folds[0]
+    crease = abs(step) / (np.hypot(*fields.gradient(step)) + 2e-3)  # pixels, to first order
+    shade = fields.ranks(0.03 * np.exp(-crease / 7) - gx - gy)
+    ink = np.clip(np.maximum(OUTLINED * (0.5 + 0.6 * shade) + 0.35 * cloud(FOLD / 3), 0.7) - crease, 0, 1)
+    for start, turn, gap in HATCHES:
+        across = np.stack([-tangent[1], tangent[0]])
+        strength = shade + 0.04 * cloud(FOLD / 4) - start
+        hatch = _hatch(np.cos(turn) * tangent + np.sin(turn) * across, strength, front, gap, shade, rng)
+        ink = np.maximum(ink, hatch)
+    grain = gaussian_filter(rng.standard_normal(shape), (0.6, 2.5), mode="wrap")
+    paper = fields.rgb(LAID) * (1 + 0.012 * grain / grain.std())[..., None]
+    return paper + (0.95 * ink)[..., None] * (fields.rgb(GALL) - paper)
+
+
+def _evened(tangent: Array) -> Array:
+    """Lines of a field without its whirls: of vectors of double angle, to which a line's sense is the same."""
+    doubled = gaussian_filter((tangent[0] + 1j * tangent[1]) ** 2, EVEN, mode="wrap")
+    line = np.sqrt(doubled / (abs(doubled) + 1e-12))
+    return np.stack([line.real, line.imag])
+
+
+def _hatch(tangent: Array, strength: Array, front: Array, gap: float, shade: Array, rng: Generator) -> Array:
+    """Cover of strokes along a tangent, where a strength is positive, evenly apart.
+
+    The longest free piece of each of many lines (Jobard and Lefer, Creating evenly-spaced streamlines, 1997).
+    """
+    shape = strength.shape
+    middles = rng.permutation(strength.size)[: round(3 * strength.size / gap**2)]
+    middles = middles[strength.flat[middles] > 0]
+    places, ways = _traced(tangent, np.stack(np.unravel_index(middles, shape)) + 0.5)
+    pixels = np.floor(places).astype(int) % np.array(shape)[:, None, None]
+    straight = abs(np.sum(ways * ways[:, :, [HALF]], axis=0)) > 0.6
+    clear = straight & (strength[*pixels] > 0) & (front[*pixels] == front[*pixels[:, :, [HALF]]])
+    disc = np.mgrid[-4:5, -4:5].reshape(2, -1)
+    disc = disc[:, np.hypot(*disc) < gap - 0.5]
+    taken, t = np.zeros(shape, bool), np.zeros(clear.shape)
+    for stroke, (row, column) in enumerate(zip(*pixels, strict=True)):
+        if taken[row[HALF], column[HALF]]:
+            continue
+        ends = np.flatnonzero(~clear[stroke] | taken[row, column])
+        start, stop = ends[ends < HALF].max(initial=-1) + 1, ends[ends > HALF].min(initial=len(row))
+        if stop - start >= SHORTEST:
+            t[stroke, start:stop] = (np.arange(stop - start) + 0.5) / (stop - start)
+            around = row[start:stop, None] + disc[0], column[start:stop, None] + disc[1]
+            taken[around[0] % shape[0], around[1] % shape[1]] = True
+    drawn = t > 0
+    which, step = np.nonzero(drawn)
+    pen = np.interp(shade[*pixels[:, drawn]], (0, 1), PEN) * rng.normal(1, 0.12, len(t))[which]
+    half = pen / 2 * np.minimum(1, 0.35 + 2.5 * t[drawn]) * np.sqrt(1 - t[drawn] ** 2.5)
+    hand = TREMBLE * np.sin(step / rng.uniform(2.5, 5, len(t))[which] + rng.uniform(0, 2 * np.pi, len(t))[which])
+    way = ways[:, drawn]
+    place = places[:, drawn] + hand * np.stack([way[1], -way[0]])
+    cover = np.zeros(shape)
+    for offset in np.ndindex(5, 5):
+        pixel = np.floor(place).astype(int) + np.array(offset)[:, None] - 2
+        y, x = pixel + 0.5 - place
+        near = np.clip(half + 0.5 - abs(y * way[1] - x * way[0]), 0, 1) * (abs(y * way[0] + x * way[1]) < 0.75)
+        np.maximum.at(cover, tuple(pixel % np.array(shape)[:, None]), near)
+    return cover
+
+
+def _traced(tangent: Array, middles: Array) -> tuple[Array, Array]:
+    """Places (2, N, 2 HALF + 1) on the lines of a field through the middles, and its directions there, as (y, x)."""
+    side = np.array(tangent.shape[1:])[:, None]
+    halves = []
+    for sense in (-1, 1):
+        place, way, half = middles, sense * tangent[::-1, *np.floor(middles).astype(int)], []
+        for _ in range(HALF + 1):
+            half.append((place, sense * way))
+            place = place + way
+            line = tangent[::-1, *(np.floor(place).astype(int) % side)]
+            way = line * np.copysign(1, np.sum(line * way, axis=0))
+        halves.append(half)
+    path = np.array(halves[0][:0:-1] + halves[1])
+    return path[:, 0].transpose(1, 2, 0), path[:, 1].transpose(1, 2, 0)
+
+
 def _lit(canvas: Array, relief: Array) -> Array:
     """Thick paint under a lamp at the upper left."""
     slope = (relief - np.roll(relief, (1, 1), (0, 1))) / 2
@@ -260,6 +413,8 @@ STYLES: dict[str, Callable[[tuple[int, int], Generator], Array]] = {
     "mosaic": mosaic,
     "woodcut": woodcut,
     "watercolour": watercolour,
+    "pointillism": pointillism,
+    "hatching": hatching,
 }
 """Name -> what paints a style picture of a size: see `painting`."""
 """Each paints (H, W, 3) of a given shape."""
