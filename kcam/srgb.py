@@ -20,6 +20,8 @@ from torch import Tensor
 from kcam.cache import is_plain
 from kcam.ste import clip_ste
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of Rec. 709's primaries, which sRGB has: of linear light the luminance, of coded values the luma."""
 _PIECE = 2**17
 """Numbers per thread: half a megabyte, and as much again for what is added."""
 _CODED, _LIGHT = 0.0404482362771082, 0.00313066844250063

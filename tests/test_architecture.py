@@ -27,6 +27,7 @@ LAYERS = [
     {"kcam.scene"},
     {"kcam.optics"},
     {"kcam.sensor"},
+    {"kcam.texture"},
     {"kcam.isp"},
     {"kcam.camera"},
     {"kcam.planner", "kcam.linear", "kcam.burst"},

@@ -12,10 +12,10 @@ from torch.nn import functional as F
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.srgb import LUMINANCE
 from kcam.ste import clip_ste, round_ste
 from kcam.units import check_positive
 
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 LUMA = (0.299, 0.587, 0.114)
 BLACK = 2.0**-6
 """Of white: darker tones are brightened no further."""

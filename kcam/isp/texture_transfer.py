@@ -13,13 +13,14 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
-from kcam.isp.finish import LUMINANCE
 from kcam.isp.pieces import Book, lay_pieces, shown_by, turned
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.srgb import LUMINANCE
 from kcam.ste import clip_ste
+from kcam.texture.descent import descend
+from kcam.texture.features import OPPONENT, SteerableFeatures
+from kcam.texture.losses import StyleLoss
 
-OPPONENT = ((1.0, 0.0, -1.0), (-0.5, 1.0, -0.5))
-"""Red against blue, green against both."""
 LEVELS, ROUNDS = (8, 4, 2, 1), (12, 10, 8, 4)
 """By how much each level is smaller, and how often its pieces are offered others."""
 LEAST = 32
@@ -49,6 +50,11 @@ FURTHER = (8.0, 16.0, 32.0)
 FLOW_CELL = 8
 """Pixels between random directions where there are none."""
 QUANTILES = 128
+FINISH: dict[str, Any] = {"colour": 1.0, "content": 1.0, "flat": 1e-2}
+"""Of the loss that a picture of pieces is moved down on, beside the style's weight of 1."""
+RATE = 0.0075
+AT_ONCE, SHARED = 1024, 64
+"""Pixels a side that are moved down at once, with 1.7 GB, and that neighbours share."""
 LEAST_DEVIATION = 2e-3
 """Of an exemplar's luma: below it is flat, and has no pieces to take."""
 
@@ -94,7 +100,7 @@ def _standard(planes: Tensor) -> Tensor:
 
 def _colours(picture: Tensor) -> Tensor:
     """Of the neighbourhood, beside its brightness, (2,H,W)."""
-    return _standard(_blur(torch.einsum("nc,chw->nhw", picture.new_tensor(OPPONENT), picture), WIDE / 2))
+    return _standard(_blur(torch.einsum("nc,chw->nhw", picture.new_tensor(OPPONENT[1:]), picture), WIDE / 2))
 
 
 def _with_tones_of(values: Tensor, others: Tensor) -> Tensor:
@@ -191,6 +197,8 @@ def _transferred(
     seam: float,
     glaze: Tensor | float,
     palette: float,
+    loss: StyleLoss | None,
+    steps: int,
     generator: torch.Generator,
 ) -> Tensor:
     height, width = picture.shape[-2:]
@@ -216,12 +224,37 @@ def _transferred(
         painted = painted + like(glaze, painted) * _blur(tone - _blur(_luma(painted)[None], FINE), GLAZED)
     if palette:
         painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
-    return clip_ste(painted, 0.0, 1.0)[:, :height, :width]
+    painted = clip_ste(painted, 0.0, 1.0)[:, :height, :width]
+    return painted if loss is None else _finished(painted, picture, loss, steps)
+
+
+def _finished(painted: Tensor, scene: Tensor, loss: StyleLoss, steps: int) -> Tensor:
+    """(3,H,W) some steps down the loss, whose slope goes through: where pieces meet it mends what no piece could."""
+    height, width = painted.shape[-2:]
+    total, weights = torch.zeros_like(painted), torch.zeros_like(painted[:1])
+    for rows, down in _parts(height):
+        for columns, right in _parts(width):
+            part = descend(
+                loss, painted[None, :, rows, columns], scene=scene[None, :, rows, columns], steps=steps, rate=RATE
+            )
+            share = down[:, None].to(part) * right.to(part)
+            total[:, rows, columns] += share * part[0]
+            weights[:, rows, columns] += share
+    return painted + (total / weights - painted).detach()
+
+
+def _parts(length: int) -> list[tuple[slice, Tensor]]:
+    """Where to cut a side, and how much each part counts there: less and less in what it shares."""
+    count = max(1, math.ceil((length - SHARED) / (AT_ONCE - SHARED)))
+    size = math.ceil((length + (count - 1) * SHARED) / count)
+    starts = [min(index * (size - SHARED), length - size) for index in range(count)]
+    place = torch.arange(size) + 0.5
+    return [(slice(start, start + size), torch.minimum(place, size - place).clamp(max=SHARED)) for start in starts]
 
 
 def _with_colours_of(picture: Tensor, other: Tensor) -> Tensor:
     """With the mean and covariance of another one's colours; what is brighter stays brighter."""
-    basis = picture.new_tensor((LUMINANCE, *OPPONENT))
+    basis = picture.new_tensor((LUMINANCE, *OPPONENT[1:]))
     own, theirs = (basis @ one.flatten(1) for one in (picture, other))
     aim = torch.cov(theirs, correction=0)
     steady = STEADY * aim + 1e-5 * torch.eye(3).to(aim)
@@ -236,7 +269,7 @@ def texture_transfer(
     picture: Tensor,
     *,
     exemplar: Tensor,
-    detail: float = 4.0,
+    detail: float = 8.0,
     seam: float = 6.0,
     flow: float = 2.0,
     colour: float = 0.0,
@@ -244,6 +277,7 @@ def texture_transfer(
     glaze: Tensor | float = 0.6,
     palette: float = 1.0,
     turns: int = 8,
+    steps: int = 20,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Paint pictures anew with pieces of an exemplar, which lie where tone, direction and colour ask for them.
@@ -255,7 +289,8 @@ def texture_transfer(
     brought to the exemplar's distribution, v the direction of its level lines at twice the angle, c the colour around
     it; those with a prime are the exemplar's, in each of its turns. w is small where a picture is even: there the
     exemplar goes on as it is. Directions flow from edges into even areas; where there are none they are drawn. What
-    the pieces show, with the glaze, is brought to the mean and covariance of the exemplar's colours.
+    the pieces show, with the glaze, is brought to the mean and covariance of the exemplar's colours, and then moved a
+    little way down on the loss that cameras are trained by, so that what pieces have broken goes on and a face is one.
 
     Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
                own pixels; of more than half a megapixel the middle is taken.
@@ -263,6 +298,8 @@ def texture_transfer(
                glaze: share of t + m, as far as the pieces do not show it, that is laid over them softly, >= 0.
                palette: share of the way to the exemplar's colours, 0..1.
                turns: of the exemplar, evenly spread over a whole one; 1 leaves its strokes as they lie.
+               steps: down on the loss (`style.StyleLoss`), a third of the time; none where the picture or the exemplar
+               has a side of less than 64 pixels.
                generator: of what chance offers; None for torch's default one.
     Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
                and the glaze as far as that is laid over: which piece lies where has no slope.
@@ -287,9 +324,13 @@ def texture_transfer(
         )
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
-    source = _Exemplar(_cropped(exemplar.to(picture)), turns=turns, detail=detail, flow=flow, colour=colour)
-    how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "generator": generator}
-    return torch.stack([_transferred(one, source, **how) for one in picture])
+    shown = _cropped(exemplar.to(picture))
+    source = _Exemplar(shown, turns=turns, detail=detail, flow=flow, colour=colour)
+    loss = None
+    if steps and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least:
+        loss = StyleLoss(shown.detach(), **FINISH)
+    how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "loss": loss, "steps": steps}
+    return torch.stack([_transferred(one, source, **how, generator=generator) for one in picture])
 
 
 def _cropped(exemplar: Tensor) -> Tensor:
@@ -308,6 +349,7 @@ class TextureTransfer(Stage):
 
     Args:      exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way; it is saved with the camera.
                detail, seam, flow, colour: weights, >= 0.  local, palette: 0..1.  glaze: >= 0.  turns: 1 or more.
+               steps: 0 or more.
                seed: of what chance offers; None: from the camera's generator, each picture another one.
     Raises:    TypeError, ValueError for an exemplar that is no picture, flat or too small, or values out of range.
 
@@ -325,7 +367,7 @@ class TextureTransfer(Stage):
         self,
         exemplar: Tensor,
         *,
-        detail: float = 4.0,
+        detail: float = 8.0,
         seam: float = 6.0,
         flow: float = 2.0,
         colour: float = 0.0,
@@ -333,6 +375,7 @@ class TextureTransfer(Stage):
         glaze: Tensor | float = 0.6,
         palette: float = 1.0,
         turns: int = 8,
+        steps: int = 20,
         seed: int | None = None,
     ) -> None:
         super().__init__()
@@ -341,12 +384,12 @@ class TextureTransfer(Stage):
             check_not_negative(value, name=name, unit="(0 for nothing)")
         for name, value in (("local", local), ("palette", palette)):
             check_not_negative(value, name=name, unit="(0 for nothing)", most=1.0)
-        for name, number, least in (("turns", turns, 1), ("seed", 0 if seed is None else seed, 0)):
+        for name, number, least in (("turns", turns, 1), ("steps", steps, 0), ("seed", 0 if seed is None else seed, 0)):
             if isinstance(number, bool) or not isinstance(number, int) or number < least:
                 raise ValueError(f"{name} must be a whole number of at least {least}, got {number!r}.")
         hold(self, exemplar=exemplar, glaze=glaze)
         self.detail, self.seam, self.flow, self.colour = detail, seam, flow, colour
-        self.local, self.palette, self.turns, self.seed = local, palette, turns, seed
+        self.local, self.palette, self.turns, self.steps, self.seed = local, palette, turns, steps, seed
 
     def mean(self) -> TextureTransfer:
         """One picture of those that it paints, always the same, not their mean. Shares the exemplar."""
@@ -374,6 +417,7 @@ class TextureTransfer(Stage):
             glaze=self.glaze,
             palette=self.palette,
             turns=self.turns,
+            steps=self.steps,
             generator=told if seed is None else torch.Generator("cpu").manual_seed(seed),
         )
 

@@ -1,7 +1,5 @@
 """Cameras that learn a painting's style: features, losses, training, and painting itself."""
 
-from kcam.style.features import SteerableFeatures
-from kcam.style.losses import StyleLoss
 from kcam.style.painting import paint
 from kcam.style.pictures import STYLES, painting
 from kcam.style.presets import PRESETS, Preset, style_camera
@@ -10,6 +8,8 @@ from kcam.style.scenes import BuiltinScenes, PatchScenes, PhotoScenes, Source
 from kcam.style.settings import Settings
 from kcam.style.training import Progress, Trained, fit
 from kcam.style.vgg import VGG16Features
+from kcam.texture.features import SteerableFeatures
+from kcam.texture.losses import StyleLoss
 
 __all__ = [
     "PRESETS",

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from kcam.inputs import check_picture
-from kcam.ste import clip_ste
 from kcam.style.generators import torch_generator
-from kcam.style.losses import StyleLoss
-from kcam.threads import no_more_than_free
+from kcam.texture.descent import GRAY, descend
+from kcam.texture.losses import StyleLoss
 
 STARTS = ("photo", "noise")
 NOISE = 0.15  # RMS of the white noise that a picture may start from, around gray
-GRAY = 0.45
-CORNERS = 0.1
 
 
 def paint(
@@ -70,48 +65,10 @@ def paint(
     if photo is not None:
         check_picture(photo, name="photo", channels=(3,), ndims=(3,))
     height, width = photo.shape[-2:] if photo is not None else shape or (0, 0)
-    multiple, least = (int(size) for size in (loss.features.multiple, loss.features.least))
-    rows, columns = (max(least, math.ceil(size / multiple) * multiple) for size in (height, width))
     device: Any = loss.quantiles.device
-    scene = None
-    if photo is not None:
-        scene = F.pad(photo[None].float().to(device), (0, columns - width, 0, rows - height), mode="replicate")
-    if start == "photo" and scene is not None:
-        begun = scene
-    else:
-        noise = torch.randn(1, 3, rows, columns, generator=torch_generator(seed, 0))
+    scene = None if photo is None else photo[None].float().to(device)
+    begun = scene
+    if start == "noise" or begun is None:
+        noise = torch.randn(1, 3, height, width, generator=torch_generator(seed, 0))
         begun = (GRAY + NOISE * noise).clamp(0, 1).to(device)
-    scale = spectral_scale(rows, columns).to(begun)
-    spectrum = torch.view_as_real(torch.fft.rfft2(begun - GRAY, norm="ortho") / scale).clone().requires_grad_()
-    optimiser = torch.optim.Adam([spectrum], lr=rate)
-    for step in range(steps):
-        with no_more_than_free():
-            optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
-            optimiser.zero_grad()
-            terms = loss.terms(_picture(spectrum, scale, (rows, columns)), scene, turn=step)
-            total = torch.stack(list(terms.values())).sum()
-            if not total.isfinite():
-                raise ValueError(f"the loss is {total.item():g} at step {step}. Use a lower rate than {rate:g}.")
-            total.backward()
-            optimiser.step()
-        if advance is not None:
-            advance(step + 1, {name: float(value.detach()) for name, value in terms.items()})
-    with torch.no_grad():
-        return _picture(spectrum, scale, (rows, columns))[0, :, :height, :width].clone()
-
-
-def spectral_scale(height: int, width: int) -> Tensor:
-    """The 1 / f that a picture's spectrum falls by, (H, W/2+1), of mean square 1.
-
-    Beyond 0.5 cycles per pixel, in the corners of the spectrum, features see little: there it is a tenth, or noise
-    would grow.
-    """
-    frequency = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width))
-    scale = 1 / frequency.clamp(min=1 / max(height, width))
-    scale = torch.where(frequency > 0.5, CORNERS * scale, scale)
-    return scale / scale.square().mean().sqrt()
-
-
-def _picture(spectrum: Tensor, scale: Tensor, shape: tuple[int, int]) -> Tensor:
-    values = torch.fft.irfft2(torch.view_as_complex(spectrum) * scale, s=shape, norm="ortho")
-    return clip_ste(values + GRAY, 0.0, 1.0)
+    return descend(loss, begun, scene=scene, steps=steps, rate=rate, advance=advance)[0]

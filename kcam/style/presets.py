@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from kcam import isp, optics, sensor
 from kcam.camera import Camera
 from kcam.context import Context
-from kcam.style.losses import StyleLoss
 from kcam.style.settings import Settings
+from kcam.texture.losses import StyleLoss
 from kcam.units import mm, nm, um
 
 DOE_SIDE = 64

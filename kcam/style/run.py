@@ -21,12 +21,12 @@ from kcam.plain import fitting
 from kcam.planner import Plan
 from kcam.style.checkpoints import Checkpoints
 from kcam.style.generators import torch_generator
-from kcam.style.losses import StyleLoss, luminance
 from kcam.style.optimiser import load_optimiser_state, optimiser_state
 from kcam.style.processes import place, start_alike, told_by_the_first
 from kcam.style.scenes import Source
 from kcam.style.settings import Settings, trained_parameters
 from kcam.style.step import gradients
+from kcam.texture.losses import StyleLoss, luminance
 
 NOISE_STREAM = 2**40  # streams of the camera's noise lie beyond those of the scenes: one for each row and stage
 MOST_STAGES = 2**10

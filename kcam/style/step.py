@@ -19,8 +19,8 @@ from kcam import optics
 from kcam.camera import DEMOSAICING, Camera, is_random
 from kcam.context import Context, applied
 from kcam.scene import Scene
-from kcam.style.losses import StyleLoss
 from kcam.style.processes import gathered, of_the_first, place
+from kcam.texture.losses import StyleLoss
 
 Generators = Callable[[int, int], torch.Generator]
 """The generator of a row of the batch and a stage."""

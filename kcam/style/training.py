@@ -10,11 +10,11 @@ from torch import Tensor
 
 from kcam.camera import Camera
 from kcam.planner import Plan
-from kcam.style.losses import StyleLoss
 from kcam.style.processes import anywhere
 from kcam.style.run import Run
 from kcam.style.scenes import BuiltinScenes, Source
 from kcam.style.settings import Settings
+from kcam.texture.losses import StyleLoss
 from kcam.threads import fixed
 
 

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from kcam.scene import PHOTOGRAPHS
-from kcam.style.features import check_pictures
+from kcam.texture.features import check_pictures
 
 TAPS = {3: "relu1_2", 8: "relu2_2", 15: "relu3_3", 22: "relu4_3"}
 """Which of the trunk's modules, counted as in torchvision, give a layer."""

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.context import Context
 from kcam.style import PRESETS, BuiltinScenes, painting, style_camera
-from kcam.style.losses import luminance
 from kcam.style.presets import smooth_phase
 from kcam.style.settings import trained_parameters
+from kcam.texture.losses import luminance
 from kcam.units import mm, um
 
 SCENES = ("coffee", "chelsea", "motorcycle")

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kcam.scene import PHOTOGRAPHS
 from kcam.style import STYLES, SteerableFeatures, StyleLoss, paint, painting
-from kcam.style.losses import luminance, moment_loss, moments
+from kcam.texture.losses import luminance, moment_loss, moments
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:

@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam.inputs import check_floats, check_picture, remedy
-from kcam.style.features import SteerableFeatures
+from kcam.srgb import LUMINANCE
+from kcam.texture.features import SteerableFeatures
 
 FLOOR = 0.1  # of a natural picture's variance: what a flat style is divided by
 DIRECTIONS = 16  # of colour
 TURNS = 4
 COLOUR_FLOOR = 0.05  # least standard deviation that a style's colours are divided by
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 # ---- the thesis's, eq. 3.10 to 3.13 -------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from kcam.scene import PHOTOGRAPHS
 from kcam.style import SteerableFeatures, StyleLoss, painting
-from kcam.style.losses import (
+from kcam.texture.losses import (
     DIRECTIONS,
     TURNS,
     colour_directions,
