@@ -328,7 +328,8 @@ def texture_transfer(
     source = _Exemplar(shown, turns=turns, detail=detail, flow=flow, colour=colour)
     loss = None
     if steps and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least:
-        loss = StyleLoss(shown.detach(), **FINISH)
+        with torch.inference_mode(False):  # what is made there cannot be differentiated through
+            loss = StyleLoss(shown.detach().clone(), **FINISH)
     how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "loss": loss, "steps": steps}
     return torch.stack([_transferred(one, source, **how, generator=generator) for one in picture])
 
