@@ -54,7 +54,7 @@ FINISH: dict[str, Any] = {"colour": 1.0, "content": 1.0, "flat": 1e-2}
 """Of the loss that a picture of pieces is moved down on, beside the style's weight of 1."""
 RATE = 0.0075
 AT_ONCE, SHARED = 1024, 64
-"""Pixels a side that are moved down at once, with 1.7 GB, and that neighbours share."""
+"""Pixels a side that are moved down at once, with 1.6 GB, and that neighbours share."""
 LEAST_DEVIATION = 2e-3
 """Of an exemplar's luma: below it is flat, and has no pieces to take."""
 

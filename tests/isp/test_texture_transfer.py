@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from kcam import Camera, Scene, isp
 from kcam.isp import pieces, texture_transfer
-from kcam.style import painting
+from kcam.style import StyleLoss, painting
 
 transfer: Any = importlib.import_module("kcam.isp.texture_transfer")  # the module, not the function
 
@@ -44,9 +45,10 @@ def test_a_picture_is_made_of_colours_of_the_exemplar() -> None:
     levels = torch.tensor([0.1, 0.5, 0.9])
     exemplar = levels[torch.arange(64) % 12 // 4].expand(3, 64, 64)
     plain: Any = {"glaze": 0.0, "palette": 0.0, "turns": 1}
-    painted = texture_transfer(torch.rand(1, 3, 40, 48), exemplar=exemplar, generator=seeded(), **plain)
+    picture = torch.rand(1, 3, 40, 48, generator=seeded(1))
+    painted = texture_transfer(picture, exemplar=exemplar, generator=seeded(), **plain)
     apart = (painted[..., None] - levels).abs().amin(-1)
-    assert float((apart < 1e-5).float().mean()) > 0.7  # the others are where two pieces meet
+    assert float((apart < 1e-5).float().mean()) > 0.5  # the others are where two pieces meet
     assert float(painted.min()) >= 0.1 - 1e-5
     assert float(painted.max()) <= 0.9 + 1e-5
 
@@ -186,6 +188,67 @@ def test_gradients_of_exemplar_glaze_and_picture(monkeypatch) -> None:
         assert float((ends[0] - ends[1]) / (2 * step)) == pytest.approx(float((slope * along).sum()), rel=1e-4)
 
 
+def test_steps_bring_the_style_and_what_is_shown_nearer() -> None:
+    """On a loss that it is not moved down on: of other crops, and content of whole pixels' contrast."""
+    picture, exemplar = Scene.builtin("astronaut", size=96).to_srgb(), painting("watercolour", size=160)
+    zero, some = (texture_transfer(picture, exemplar=exemplar, steps=steps, generator=seeded()) for steps in (0, 20))
+    loss = StyleLoss(exemplar, crop=96, colour=0.5, levels=(2,), flat=1e-3)
+    before, after = (loss.terms(painted, scene=picture) for painted in (zero, some))
+    assert all(float(after[name]) < float(before[name]) for name in ("style", "colour", "content"))
+    assert float((some - zero).abs().mean()) < 0.1  # it is the same picture still
+
+
+def test_steps_are_for_what_the_features_can_see() -> None:
+    """64 pixels each way, of the picture and of the exemplar."""
+    for side, own in ((63, 80), (80, 63)):
+        picture, exemplar = torch.rand(1, 3, side, 80, generator=seeded()), painting("mosaic", size=80)[:, :own]
+        one, other = (
+            texture_transfer(picture, exemplar=exemplar, turns=1, steps=steps, generator=seeded()) for steps in (0, 2)
+        )
+        assert torch.equal(one, other)
+
+
+def test_steps_in_inference_mode_and_with_slopes() -> None:
+    picture, stage = (
+        torch.rand(1, 3, 64, 70),
+        isp.TextureTransfer(painting("mosaic", size=64), turns=1, steps=2, seed=0),
+    )
+    with torch.inference_mode():
+        frozen = stage(picture)
+    shown = picture.clone().requires_grad_()
+    painted = stage(shown)
+    assert torch.equal(painted.detach(), frozen)
+    bare = isp.TextureTransfer(stage.exemplar, turns=1, steps=0, seed=0)
+    slopes = (torch.autograd.grad(of(shown).clamp(0.05, 0.95).sum(), shown)[0] for of in (stage, bare))
+    assert all(bool(slope.isfinite().all()) and float(slope.abs().max()) > 0 for slope in slopes)
+
+
+def test_a_large_picture_is_moved_in_parts_without_seams(monkeypatch) -> None:
+    monkeypatch.setattr(transfer, "AT_ONCE", 96)
+    for length in (1, 95, 96, 97, 129, 500):
+        parts = transfer._parts(length)
+        covered, most = torch.zeros(length), torch.zeros(length)
+        for part, share in parts:
+            assert part.stop - part.start == len(share) <= 96
+            covered[part] += share
+            most[part] = torch.maximum(most[part], share)
+        assert float(covered.min()) > 0
+        steepest = torch.stack([F.pad(s, (p.start, length - p.stop)) / covered for p, s in parts]).diff(dim=1).abs()
+        assert len(parts) == 1 or float(steepest.max()) < 0.06  # from one part to the next over some 64 pixels
+    asked: list[tuple[int, ...]] = []
+
+    def same(loss: Any, picture: Tensor, **how: Any) -> Tensor:
+        asked.append(tuple(picture.shape))
+        assert how["scene"].shape == picture.shape
+        return picture
+
+    monkeypatch.setattr(transfer, "descend", same)
+    painted = torch.rand(3, 100, 200)
+    loss: Any = None
+    assert torch.allclose(transfer._finished(painted, torch.rand(3, 100, 200), loss, 1), painted, atol=1e-6)
+    assert len(asked) == 10
+
+
 @pytest.mark.parametrize(("shape", "value"), [((1, 1), None), ((5, 70), 0.5), ((33, 8), None), ((33, 8), 0.0)])
 def test_pictures_of_any_size_and_even_ones(shape: tuple[int, int], value: float | None) -> None:
     picture = torch.rand(2, 3, *shape) if value is None else torch.full((2, 3, *shape), value)
@@ -218,6 +281,7 @@ def test_saved_and_loaded_it_paints_the_same(tmp_path) -> None:
         (torch.rand(3, 64, 64), {"local": 2.0}, r"local must be"),
         (torch.rand(3, 64, 64), {"palette": 2.0}, r"palette must be"),
         (torch.rand(3, 64, 64), {"turns": 0}, r"turns must be a whole number of at least 1, got 0"),
+        (torch.rand(3, 64, 64), {"steps": -1}, r"steps must be a whole number of at least 0, got -1"),
         (torch.rand(3, 64, 64), {"seed": -1}, r"seed must be a whole number of at least 0, got -1"),
     ],
 )
