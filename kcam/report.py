@@ -40,6 +40,7 @@ def style_sheet(
     step: int | None = None,
     start: Camera | None = None,
     seed: int = 0,
+    pictures: Sequence[Sequence[Tensor]] | None = None,
 ) -> Figure:
     """The contact sheet of a camera in training: the style, scenes and its pictures of them, and what it has learned.
 
@@ -50,11 +51,13 @@ def style_sheet(
     Args:      style: (3,H,W) sRGB; below the whole, parts of it are shown at the scale of the pictures.
                scenes: two to four, of a batch the first. step: for the title. start: the camera before training, whose
                filter curves are dashed. seed: each picture is the one that the camera takes with this generator.
+               pictures: of each scene, as `photographed` gives them, where they are there already.
     Raises:    ValueError for no scenes; TypeError, ValueError for a style that is no picture.
     """
     if not scenes:
         raise ValueError("a sheet shows at least one scene, got none. Use scenes=[Scene.builtin('astronaut', 128)].")
-    rows = [_pictures(camera, scene, seed) for scene in scenes]
+    taken = [photographed(camera, scene, seed) for scene in scenes] if pictures is None else pictures
+    rows = [[plots.as_image(picture[0]) for picture in row] for row in taken]
     heads = ("Style", "Scene", "Camera alone", "Camera and style stage")[: len(rows[0]) + 1]
     side = (WIDTH - 2 * EDGE + GAP) / len(heads) - GAP
     heights = [side * row[0].shape[0] / row[0].shape[1] for row in rows]
@@ -92,15 +95,16 @@ def style_sheet(
     return sheet.figure
 
 
-def _pictures(camera: Camera, scene: Scene, seed: int) -> list[np.ndarray]:
-    """The scene, the camera's picture before its style stage, and after it if there is one."""
+@torch.no_grad()
+def photographed(camera: Camera, scene: Scene, seed: int = 0) -> list[Tensor]:
+    """The scene, the camera's picture before its style stage, and after it if there is one: (1,3,H,W) each."""
     scene = scene.samples([0])
     split = next((i for i, stage in enumerate(camera) if isinstance(stage, PAINTING)), len(camera))
     generator = torch.Generator(scene.device).manual_seed(seed)
     pictures = [scene.to_srgb(), camera[:split](scene, generator=generator)]
     if split < len(camera):
         pictures.append(camera[split:](pictures[-1], generator=generator))
-    return [plots.as_image(picture[0]) for picture in pictures]
+    return pictures
 
 
 def _part(image: np.ndarray, shape: Sequence[int], *, share: float) -> np.ndarray:

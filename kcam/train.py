@@ -17,7 +17,7 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
-from kcam import __version__, files, isp, plots, report, style
+from kcam import __version__, card, files, isp, plots, report, style
 from kcam.camera import PAINTING, Camera
 from kcam.inputs import named
 from kcam.plain import from_json
@@ -29,6 +29,10 @@ fcntl: Any = importlib.import_module("fcntl") if os.name == "posix" else None
 
 SHOWN = ("astronaut", "coffee", "chelsea")
 SHOWN_SIZE = 256
+WHAT_BRINGS = (
+    "A camera alone can bring the colours of a style, not its strokes: its optics only take detail away, its filter "
+    "and matrix act on each pixel. What brings strokes stands behind it: pieces of the style itself, or a network."
+)
 FEATURES = ("steerable", "vgg16")
 
 
@@ -93,8 +97,10 @@ def run(
     threads: int | None = None,
     advance: Callable[[style.Progress, int], None] | None = None,
     say: Callable[[str], None] = lambda text: None,
+    folder_of_card: str | os.PathLike[str] | None = None,
+    licence: str | None = None,
 ) -> style.Trained:
-    """Train a camera, and write it, a contact sheet and the loss curve at every checkpoint, and a report at the end.
+    """Train a camera, and write it, its card, sheet and loss curve at every checkpoint, and a report at the end.
 
     Killed at any moment, a run with the same options and `resume` ends in the same camera, bit for bit. Ctrl-C and
     SIGTERM end it after the step, with a checkpoint. Under torchrun the processes share the batch.
@@ -102,11 +108,15 @@ def run(
     Args:      threads: None for the cores that are free, or with `resume` as many as the run began with.
                advance: called after each step with the number of all steps.
                say: called with lines that a user should read.
+               folder_of_card: where to put the camera with its card, ready for a hub. licence: of the style.
     Raises:    as `kcam.style.fit`; ValueError for options that do not fit together or another run's folder.
     """
     out = Path(options.out)
     plots.check_writable(out, suffixes=(".safetensors",))
     files.check_other(out, options.camera)
+    card.check_own(out.with_suffix(".md"))
+    if folder_of_card is not None:
+        card.check_folder(folder_of_card)
     if options.device not in ("cpu", "cuda") or (options.device == "cuda" and not torch.cuda.is_available()):
         raise ValueError(f'cannot train on "{options.device}": expected cpu, or cuda where torch finds a GPU.')
     folder = out.with_suffix("")
@@ -133,6 +143,12 @@ def run(
         settings = preset.for_scenes(
             len(source), seed=options.seed, **{name: value for name, value in changes.items() if value is not None}
         )
+        if min(picture.shape[-2:]) < settings.size:
+            say(
+                f"the style has {picture.shape[-1]} x {picture.shape[-2]} pixels, less than the {settings.size} x "
+                f"{settings.size} that are trained on: what is wider is not learned, and pieces repeat. A larger "
+                "picture paints better, not an enlarged one."
+            )
         weights = {} if options.content is None else {"content": options.content}
         loss = preset.style_loss(picture.to(device), features=features.to(device), crop=settings.size, **weights).to(
             device
@@ -171,6 +187,10 @@ def run(
             trained = replace(trained, camera=_with(trained.camera, paints))
             trained.camera.cpu().save(out)
             _write_report(folder / "report.html", options, settings, trained, figures)
+            told = _card(options, settings, trained, figures["pictures"], loss, licence)
+            card.write(told, out, folder)
+            if folder_of_card is not None:
+                card.write_folder(told, out, folder, Path(folder_of_card))
         elif leads:
             say(f"stopped after {len(trained.history)} of {settings.steps} steps; go on with --resume")
     return trained
@@ -189,13 +209,14 @@ def _show(
 ) -> dict[str, Any]:
     """Draw the contact sheet and the loss curve of a checkpoint into the folder."""
     names = ("total", *(name for name, weight in loss.weights.items() if weight))
+    pictures = [report.photographed(camera, scene) for scene in scenes]
     figures = {
-        "sheet": report.style_sheet(camera, style=picture, scenes=scenes, step=step, start=start),
+        "sheet": report.style_sheet(camera, style=picture, scenes=scenes, step=step, start=start, pictures=pictures),
         "loss": report.loss_figure(history, names),
     }
     for name, figure in figures.items():
         plots.save_figure(figure, folder / f"{name}.png")
-    return figures
+    return figures | {"pictures": pictures}
 
 
 def _camera(options: Options, preset: style.Preset) -> Camera:
@@ -326,10 +347,65 @@ def _stopping() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
+def _card(
+    options: Options,
+    settings: Any,
+    trained: style.Trained,
+    pictures: Sequence[Sequence[Tensor]],
+    loss: style.StyleLoss,
+    licence: str | None,
+) -> card.Card:
+    own = options.style in style.STYLES
+    name = Path(options.style).name
+    return card.Card(
+        f"A camera for {Path(options.style).stem}",
+        style=f"{name}, drawn by kcam's own code" if own else name,
+        licence=licence or ("MIT, as kcam's" if own else None),
+        facts=[(k, Path(v).name if k in ("style", "scenes") else v) for k, v in _facts(options, settings, trained)],
+        measures=_measures(loss, pictures),
+        notes=[
+            f"Means over {len(pictures)} built-in photographs ({', '.join(SHOWN)}) on which cameras are trained unless "
+            "others are given; smaller is nearer. Style and colour are distances from the style, content is what is "
+            "lost of the scene.",
+            WHAT_BRINGS,
+        ],
+    )
+
+
+def _measures(loss: style.StyleLoss, pictures: Sequence[Sequence[Tensor]]) -> list[tuple[str, ...]]:
+    """Each weighted term of the loss, the means over scenes; of as much of a picture as the features take."""
+    multiple, least = loss.features.multiple, loss.features.least
+    if not pictures or min(pictures[0][0].shape[-2:]) < least:
+        return []
+    terms = []
+    for row in pictures:
+        scene, *shots = (
+            x[..., : x.shape[-2] // multiple * multiple, : x.shape[-1] // multiple * multiple] for x in row
+        )
+        with torch.no_grad():
+            terms.append([loss.terms(picture.clamp(0, 1), scene) for picture in (scene, *shots)])
+    names = [name for name in terms[0][0] if name != "l2"]
+    means = [[sum(float(row[k][name]) for row in terms) / len(terms) for k in range(len(terms[0]))] for name in names]
+    heads = ("what it shows", "the scene itself", "camera alone", "and what paints")[: len(terms[0]) + 1]
+    return [heads, *((f"loss: {name}", *(f"{x:.3f}" for x in row)) for name, row in zip(names, means, strict=True))]
+
+
 def _write_report(path: Path, options: Options, settings: Any, trained: style.Trained, figures: dict[str, Any]) -> None:
+    report.write_report(
+        path,
+        title=f"A camera for {Path(options.style).stem}",
+        summary=_facts(options, settings, trained),
+        figures=[("Contact sheet", figures["sheet"]), ("Loss", figures["loss"])],
+        advice=trained.advice,
+        notes=[WHAT_BRINGS],
+    )
+
+
+def _facts(options: Options, settings: Any, trained: style.Trained) -> list[tuple[str, str]]:
+    """Settings and results, for a page."""
     seconds = sum(trained.profile.values())
     last = dict(zip(trained.names, trained.history[-20:].mean(0).tolist(), strict=True))
-    summary = [
+    return [
         ("style", options.style),
         ("preset", options.preset),
         ("steps", f"{settings.steps} of {settings.batch} scenes of {settings.size} x {settings.size} pixels"),
@@ -339,15 +415,3 @@ def _write_report(path: Path, options: Options, settings: Any, trained: style.Tr
         *((f"loss: {name}", f"{value:.4f}") for name, value in last.items()),
         ("versions", f"kcam {__version__}, torch {torch.__version__}, {torch.get_num_threads()} threads"),
     ]
-    report.write_report(
-        path,
-        title=f"A camera for {Path(options.style).stem}",
-        summary=summary,
-        figures=[("Contact sheet", figures["sheet"]), ("Loss", figures["loss"])],
-        advice=trained.advice,
-        notes=[
-            "A camera alone can bring the colours of a style, not its strokes: its optics only take detail away, its "
-            "filter and matrix act on each pixel. What brings strokes stands behind it: pieces of the style "
-            "itself, or a network."
-        ],
-    )

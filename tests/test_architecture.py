@@ -35,7 +35,7 @@ LAYERS = [
     {"kcam.style"},
     {"kcam.tradeoff"},
     {"kcam.plots"},
-    {"kcam.report"},
+    {"kcam.report", "kcam.card"},
     {"kcam.calibration", "kcam.analysis"},
     {"kcam.demo", "kcam.shoot", "kcam.train"},
     {"kcam.cli"},

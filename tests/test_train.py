@@ -28,7 +28,7 @@ def invoke(command: str):
 
 
 def without_pictures(monkeypatch) -> None:
-    monkeypatch.setattr(train, "_show", lambda *arguments, **named: {})
+    monkeypatch.setattr(train, "_show", lambda *arguments, **named: {"pictures": []})
     monkeypatch.setattr(train, "_write_report", lambda *arguments: None)
 
 
@@ -46,7 +46,7 @@ def small_ones(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(CHOSEN, "style", str(path))
         patch.setattr(train, "SHOWN", ("coffee",))
-        patch.setattr(train, "SHOWN_SIZE", 48)
+        patch.setattr(train, "SHOWN_SIZE", 96)
         yield
 
 
@@ -149,6 +149,23 @@ def test_a_run_that_could_not_begin_leaves_its_name_free(tmp_path: Path, monkeyp
     assert run(moved, size=64, steps=1, resume=True)[0].finished  # under another name
 
 
+def test_it_writes_a_card_with_what_was_measured(tmp_path: Path, trained: Path) -> None:
+    text = trained.with_suffix(".md").read_text()
+    style = Path(CHOSEN["style"]).name
+    assert f"\n{style}; licence: unknown." in text
+    assert str(Path(CHOSEN["style"]).parent) not in text
+    assert f"({trained.stem}/sheet.png)" in text
+    rows = {
+        line.split(" | ")[0][2:]: line.strip("| ").split(" | ")[1:] for line in text.splitlines() if "| loss: " in line
+    }
+    before, alone, painted = (float(value) for value in rows["loss: style"])
+    assert painted < 0.5 * min(before, alone)  # pieces of the style itself
+    assert float(rows["loss: content"][0]) == 0
+    (tmp_path / "notes.md").write_text("mine")
+    with pytest.raises(ValueError, match=r"notes.md is no model card of kcam's"):
+        run(tmp_path / "notes.safetensors")
+
+
 def test_nothing_that_is_read_is_written_over(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     camera, photo = tmp_path / "mine.safetensors", tmp_path / "photo.png"
@@ -192,6 +209,18 @@ def test_a_run_that_diverges_is_one_line(tmp_path: Path, monkeypatch) -> None:
     assert "[/b]" in result.output
 
 
+def test_a_style_smaller_than_the_crops_is_told(tmp_path: Path, monkeypatch) -> None:
+    without_pictures(monkeypatch)
+    for width, told in ((64, 0), (112, 1)):
+        _, lines = run(tmp_path / f"{width}.safetensors", style_size=96, steps=1, size=width)
+        assert len(lines) == told
+    assert lines[0].startswith("the style has 96 x 96 pixels, less than the 112 x 112 that are trained on: ")
+    flat = tmp_path / "flat.png"
+    plots.write_picture(torch.full((3, 80, 80), 0.5), flat)
+    with pytest.raises(ValueError, match=r"the exemplar is flat: .* A picture of one colour has no strokes"):
+        run(tmp_path / "flat.safetensors", style=str(flat), stage=True)
+
+
 def test_a_gray_style_and_a_smaller_one(tmp_path: Path) -> None:
     path = tmp_path / "gray.png"
     plots.write_picture(painting("woodcut", size=(96, 160)).mean(0, keepdim=True), path)
@@ -233,7 +262,7 @@ def test_train_shoot_and_paint_as_commands(tmp_path: Path, trained: Path, monkey
     options = "--steps 1 --size 64 --batch 1 --no-stage --threads 1 --profile --out a.safetensors"
     result = invoke(f"train {style} {options}")
     assert result.exit_code == 0, result.output
-    assert "a.safetensors\na/report.html" in result.output
+    assert "a.safetensors\na.md\na/report.html" in result.output
     assert "s a step" in result.output
     plots.write_picture(Scene.builtin("chelsea", 96).to_srgb()[0], "photo.png")
     result = invoke(f"shoot photo.png --camera {trained} --out shot.png --seed 3")

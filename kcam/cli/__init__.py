@@ -437,6 +437,10 @@ def train(
     threads: Annotated[int, typer.Option("--threads", min=0, help="0: the cores that are free")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
     profile: Annotated[bool, typer.Option("--profile", help="print where a step's time goes")] = False,
+    card: Annotated[
+        str, typer.Option("--card", help="a folder to write, ready for a hub: the camera, README.md, pictures")
+    ] = "",
+    licence: Annotated[str, typer.Option("--licence", help="of the style, for the camera's card")] = "",
 ) -> None:
     """Train a camera to take its pictures in the manner of a painting."""
     with one_line_errors():
@@ -473,6 +477,8 @@ def train(
                     options,
                     resume=resume,
                     threads=threads or None,
+                    folder_of_card=card or None,
+                    licence=licence or None,
                     advance=one if leads else None,
                     say=lambda text: err.print(text, markup=False) if leads else None,
                 )
@@ -483,7 +489,7 @@ def train(
             for part, seconds in trained.profile.items():
                 typer.echo(f"{part:10} {seconds / max(1, trained.steps_timed):8.3f} s a step  {seconds / done:4.0%}")
         if trained.finished and leads:
-            typer.echo(f"{out}\n{out.with_suffix('')}/report.html")
+            typer.echo(f"{out}\n{out.with_suffix('.md')}\n{out.with_suffix('')}/report.html")
         if not trained.finished:
             raise typer.Exit(3)
 

@@ -1,0 +1,127 @@
+"""A model card: what a trained camera is, for people who get its file without its story."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from kcam import files
+
+MARK = "library_name: kcam"
+"""In the head of each card: a file without it is somebody else's, and is not replaced."""
+SHOWN = ("sheet.png", "loss.png")
+"""Pictures of a run's folder that a card shows, and takes along."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a card tells. title: its head. style: what the camera learned, and `licence` whose that is.
+
+    facts: (name, value) of the settings. measures: rows of a table, the first of them the heads. notes: paragraphs.
+
+    Example:
+    >>> from kcam.card import Card
+    >>> card = Card("A camera", style="my.png", licence=None, facts=[("steps", "3")], measures=[], notes=[])
+    >>> card.text("painter.safetensors", {"sheet.png": "sheet.png"}).splitlines()[:3]
+    ['---', 'library_name: kcam', 'license: unknown']
+    """
+
+    title: str
+    style: str
+    licence: str | None
+    facts: Sequence[tuple[str, str]]
+    measures: Sequence[Sequence[str]]
+    notes: Sequence[str]
+
+    def text(self, camera: str, pictures: Mapping[str, str]) -> str:
+        """Markdown, with the head that hubs read. pictures: where those of the run are found from here."""
+        head = [
+            "---",
+            MARK,
+            f"license: {_yaml(self.licence or 'unknown')}",
+            "tags: [kcam, camera, style-transfer]",
+            "---",
+        ]
+        parts = ["\n".join(head), f"# {self.title}"]
+        if "sheet.png" in pictures:
+            parts.append(f"![The style, scenes, and this camera's pictures of them]({quote(pictures['sheet.png'])})")
+        parts += [
+            "A differentiable camera, made with kcam: optics, colour filter, noise, "
+            "demosaic, tone, and what paints. It is one file of weights and JSON; no code is run to open it.",
+            f"```sh\nkcam shoot photo.jpg --camera {shlex.quote(camera)} --out shot.png\n```",
+            "```python\nfrom kcam import Camera, Scene\n\n"
+            f'shot = Camera.load({json.dumps(camera)})(Scene.from_file("photo.jpg"))\n```',
+            "## The style\n\n" + self._style(),
+            "## How it was trained\n\n" + _table([("setting", "value"), *self.facts]),
+        ]
+        if self.measures:
+            parts.append("## How near it comes\n\n" + _table(self.measures))
+        if "loss.png" in pictures:
+            parts.append(f"![The loss at each step]({quote(pictures['loss.png'])})")
+        return "\n\n".join([*parts, *self.notes]) + "\n"
+
+    def _style(self) -> str:
+        known = (
+            f"licence: {_plain(self.licence)}."
+            if self.licence
+            else ("licence: unknown. Say whose it is before you pass this camera on (`kcam train --licence`).")
+        )
+        return (
+            f"{_plain(self.style)}; {known} A camera that paints with pieces of a painting holds that painting in its file."
+        )
+
+
+def check_own(path: str | os.PathLike[str]) -> None:
+    """ValueError if there is a file of that name that is no card."""
+    path = Path(path)
+    if path.exists() and (path.is_dir() or MARK not in path.read_text(errors="replace")[:1000]):
+        raise ValueError(f"{path} is no model card of kcam's, and would be lost. Move it, or choose another --out.")
+
+
+def check_folder(path: str | os.PathLike[str]) -> None:
+    """ValueError for a folder of cards that is a file, or whose README.md is something else."""
+    if Path(path).is_file():
+        raise ValueError(f"{path} is a file: expected a folder for the camera and its card, new or an earlier one.")
+    check_own(Path(path) / "README.md")
+
+
+def write(card: Card, camera: Path, run: Path) -> Path:
+    """NAME.md beside NAME.safetensors, with the pictures of the run's folder."""
+    path = camera.with_suffix(".md")
+    check_own(path)
+    shown = {name: f"{run.name}/{name}" for name in SHOWN if (run / name).exists()}
+    files.replace(path, card.text(camera.name, shown).encode())
+    return path
+
+
+def write_folder(card: Card, camera: Path, run: Path, folder: Path) -> None:
+    """A folder ready for a hub: the camera, the pictures, and README.md last. No paths of this machine."""
+    check_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    shown = [name for name in SHOWN if (run / name).exists()]
+    for source in (camera, *(run / name for name in shown)):
+        with files.replacing(folder / source.name) as temporary:
+            shutil.copyfile(source, temporary)
+    files.replace(folder / "README.md", card.text(camera.name, {name: name for name in shown}).encode())
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(_plain(cell) for cell in row) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
+
+
+def _yaml(text: str) -> str:
+    """A value of the head: quoted, unless it is a word such as CC0-1.0."""
+    return text if re.fullmatch(r"[A-Za-z][\w.-]*", text) else json.dumps(text, ensure_ascii=False)
+
+
+def _plain(text: str) -> str:
+    """One line of a table or a head: a name may hold anything."""
+    return " ".join(str(text).split()).replace("|", "\\|").replace("`", "'")
