@@ -4,6 +4,7 @@
     python -m benchmarks.style --styles strokes --arms stage --seeds 1,2                        again, by other seeds
     python -m benchmarks.style --collect                                                        write what is committed
     python -m benchmarks.style --paint                                                          docs/images/painted.jpg
+    python -m benchmarks.style --film                                                           results/style_film.json
 
 Every arm is trained on crops of kcam's built-in photographs and of the left half of a painting, or of all of it, as
 `kcam train` does; it is measured on three other photographs of 256 pixels, against the ordinary camera's picture and a
@@ -30,6 +31,7 @@ from benchmarks import style_measures as measures
 from benchmarks.common import ROOT, environment, save_jpeg, write_json
 from kcam import isp, optics, plots, sensor
 from kcam.camera import Camera
+from kcam.context import Context
 from kcam.scene import Scene, read_picture
 from kcam.style import PRESETS, STYLES, Settings, StyleLoss, fit, paint, painting, style_camera
 from kcam.units import mm, nm, um
@@ -42,6 +44,8 @@ CAMERA_STEPS = 150
 THESIS_STEPS = 300
 PAINT_STEPS = 120
 SEED = 5  # of the shots
+FILM_RESULT = RESULT.with_name("style_film.json")
+FRAMES, FILM_SIZE, PAN = 5, 192, 5  # pixels from each frame to the next
 BULKY: dict[str, Any] = {"resolutions": (110, 90, 75, 60), "largest": 600_000}  # strokes and noise
 
 
@@ -245,12 +249,18 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=WORK)
     parser.add_argument("--collect", action="store_true")
     parser.add_argument("--paint", action="store_true")
+    parser.add_argument("--film", action="store_true")
     arguments = parser.parse_args()
     if arguments.collect:
         collect(arguments.work)
         return
     if arguments.paint:
         paint_pictures()
+        return
+    if arguments.film:
+        write_json(
+            FILM_RESULT, {"environment": environment(), "rows": [film(style) for style in arguments.styles.split(",")]}
+        )
         return
     seeds = [int(seed) for seed in arguments.seeds.split(",")]
     for style, name, seed in itertools.product(arguments.styles.split(","), arguments.arms.split(";"), seeds):
@@ -314,6 +324,41 @@ def collect(work: Path) -> None:
             continue
         save_jpeg(figure, ROOT / "docs" / "images" / f"{name}.jpg", **BULKY)
         print(name)
+
+
+def film(style: str) -> dict[str, Any]:
+    """How much frames of a pan differ where they show the same, RMS: painted by themselves, and as a film.
+
+    Each frame is taken by an ordinary camera, with photons of its own.
+    """
+    photo, camera, own = Scene.builtin("astronaut").to_srgb()[0], style_camera(stage=False), halves(style)[0]
+    crops = [photo[:, 60 : 60 + FILM_SIZE, 100 - PAN * t : 100 - PAN * t + FILM_SIZE] for t in range(FRAMES)]
+    with torch.no_grad():
+        taken = [
+            camera(Scene.from_rgb(crop), generator=torch.Generator().manual_seed(t)) for t, crop in enumerate(crops)
+        ]
+        frames = torch.cat(taken).clamp(0, 1)
+        stage, seeded = isp.TextureTransfer(own), isp.TextureTransfer(own, seed=SEED)
+        films = {
+            "frames": frames,
+            "by_themselves": torch.cat([stage(frame[None], stage_context(t)) for t, frame in enumerate(frames)]),
+            "same_seed": torch.cat([seeded(frame[None]) for frame in frames]),
+            "film": seeded.film(frames, (PAN, 0)),
+        }
+    row: dict[str, Any] = {"style": style, "frames_taken": FRAMES, "pan": PAN}
+    for name, shown in films.items():
+        row[name] = float((shown[1:, ..., PAN:] - shown[:-1, ..., :-PAN]).square().mean().sqrt())
+    scene = torch.stack(crops)
+    row["detail"] = {
+        name: sum(measures.detail_correlation(a, b) for a, b in zip(films[name], scene, strict=True)) / FRAMES
+        for name in ("by_themselves", "film")
+    }
+    print(row, flush=True)
+    return row
+
+
+def stage_context(seed: int) -> Context:
+    return Context(generator=torch.Generator().manual_seed(seed))
 
 
 def paint_pictures() -> None:

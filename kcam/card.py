@@ -73,9 +73,7 @@ class Card:
             if self.licence
             else ("licence: unknown. Say whose it is before you pass this camera on (`kcam train --licence`).")
         )
-        return (
-            f"{_plain(self.style)}; {known} A camera that paints with pieces of a painting holds that painting in its file."
-        )
+        return f"{_plain(self.style)}; {known} A camera that paints with pieces of it holds all of it in its file."
 
 
 def check_own(path: str | os.PathLike[str]) -> None:

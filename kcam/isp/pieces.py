@@ -96,8 +96,9 @@ class _Laid:
         radii = [widest / 4**k for k in range(math.ceil(math.log(widest, 4)) + 1)]
         self.radii = torch.tensor([max(radius, 1.0) for radius in radii], device=asked.device)
 
-    def lay(self, places: Tensor) -> None:
-        """Begin with these."""
+    def lay(self, places: Tensor, *, kept: Tensor | None = None, keep: float = 0.0) -> None:
+        """Begin with these; leaving those that are kept, where these are not -1, has a price."""
+        self.kept, self.keep = kept, keep
         self.places, self.shown = places.clone(), self.book.shown[places]
         self.misfit = (self.weights * (self.book.compared[places] - self.asked).square()).sum(1)
 
@@ -126,6 +127,9 @@ class _Laid:
             return
         now = self.places[sites, None]
         misfit = (self.weights[sites, None] * (book.compared[places] - self.asked[sites, None]).square()).sum(2)
+        if self.kept is not None:
+            own = self.kept[sites, None]
+            misfit = misfit + self.keep * ((places != own) & (own >= 0))
         gain = misfit - self.misfit[sites, None]
         before, after = self.shown[sites, None], book.shown[places]
         for dy, dx in BESIDE:
@@ -199,12 +203,15 @@ def lay_pieces(
     seam: float,
     joint: float = 0.0,
     rounds: Sequence[int],
+    kept: Tensor | None = None,
+    keep: float = 0.0,
     generator: torch.Generator,
 ) -> Tensor:
     """Choose a place of an exemplar for each pixel of a picture, from the coarsest level to the finest.
 
     Args:      books: of each level, each twice as large as the one before.  asked, weights: (F,h,w) of each level.
                seam, joint: k and j.  rounds: of each level.  generator: of what chance offers.
+               kept: (H,W) places to begin with at the finest level, or -1; leaving one costs `keep`.
     Returns:   (H,W) indices into the last book.
     Source:    Pritch, Kav-Venaki and Peleg, Shift-map image editing, ICCV 2009, the sum; Barnes et al., PatchMatch,
                SIGGRAPH 2009, the offers; Besag, On the statistical analysis of dirty pictures (1986), the descent.
@@ -216,6 +223,9 @@ def lay_pieces(
         if coarser is None:
             some = (torch.rand(FIRST, generator=generator, device=generator.device) * len(laid.allowed)).long()
             laid.lay(laid.best_of(laid.allowed[some.clamp(max=len(laid.allowed) - 1).to(flat.device)]))
+        elif book is books[-1] and kept is not None:
+            known = kept.flatten()
+            laid.lay(torch.where(known >= 0, known, _finer(coarser, laid)), kept=known, keep=keep)
         else:
             laid.lay(_finer(coarser, laid))
         for _ in range(count):

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal, remedy
+from kcam.isp.film import anchored, motions
 from kcam.optics.numerics import fast_length
 from kcam.precision import full_precision
 from kcam.ste import clip_ste
@@ -174,8 +175,20 @@ class StyleStage(Stage):
         quiet.level = 0.0
         return quiet
 
+    def film(self, frames: Tensor, motion: Any, *, generator: torch.Generator | None = None) -> Tensor:
+        """Paint the frames (T,3,H,W) of a film with noise that moves with what they show, so that strokes do.
+
+        Args:      motion: from each frame to the next, pixels (x, y): (2,), (T-1,2), or (T-1,2,H,W) of each pixel of
+                   the later one.
+        Raises:    TypeError, ValueError for a motion of another shape, or one that is not finite.
+        """
+        return self._painted(frames, generator, motion)
+
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,3,H,W) sRGB in [0,1] to the same shape, in 0.018..0.982."""
+        return self._painted(signal, (context or Context()).generator, None)
+
+    def _painted(self, signal: Tensor, generator: torch.Generator | None, motion: Any) -> Tensor:
         check_signal(signal, channels=(3,))
         if signal.ndim != 4 or signal.shape[1] != 3:
             raise ValueError(
@@ -185,8 +198,14 @@ class StyleStage(Stage):
         if signal.numel() == 0:
             return signal
         height, width = signal.shape[-2:]
-        whole = F.pad(signal.to(self.colour.dtype), (0, -width % 4, 0, -height % 4), mode="replicate")
-        noise = self._noise(whole, (context or Context()).generator)
+        border = (0, -width % 4, 0, -height % 4)
+        whole = F.pad(signal.to(self.colour.dtype), border, mode="replicate")
+        noise = self._noise(whole, generator)
+        if motion is not None:
+            moved = motions(motion, signal)
+            if len(moved):
+                moved = F.pad(moved, border, mode="replicate")
+                noise = (anchored(noise[0], moved), anchored(noise[1], moved))
         painted = self._paint(whole, noise) if height * width <= SEEN_AT_ONCE else self._in_tiles(whole, noise)
         return painted[..., :height, :width].to(signal.dtype)
 

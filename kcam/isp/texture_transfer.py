@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
+from kcam.isp.film import carried, motions
 from kcam.isp.pieces import Book, lay_pieces, shown_by, turned
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
 from kcam.srgb import LUMINANCE
@@ -53,6 +54,8 @@ QUANTILES = 128
 FINISH: dict[str, Any] = {"colour": 1.0, "content": 1.0, "flat": 1e-2}
 """Of the loss that a picture of pieces is moved down on, beside the style's weight of 1."""
 RATE = 0.0075
+KEEP = 1.0
+"""What it costs in a film that a pixel leaves the piece that it was of."""
 AT_ONCE, SHARED = 1024, 64
 """Pixels a side that are moved down at once, with 1.6 GB, and that neighbours share."""
 LEAST_DEVIATION = 2e-3
@@ -165,7 +168,7 @@ class _Exemplar:
         return torch.cat([fine * planes[:1], wide * planes[1:2], colour * planes[2:4], flow * planes[4:6]])
 
 
-def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.Generator) -> tuple[Tensor, ...]:
+def _asked(picture: Tensor, exemplar: _Exemplar, local: float, chance: Tensor) -> tuple[Tensor, ...]:
     """Of (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (1,H,W)."""
     luma = _luma(picture)
     fine, wide = (part[None] for part in _tones(luma))
@@ -180,13 +183,18 @@ def _asked(picture: Tensor, exemplar: _Exemplar, local: float, generator: torch.
     near = _directions(luma)
     slopes = near + 0.1 * sum(_blur(near, sigma) for sigma in FURTHER)
     known = slopes[2] / (slopes[2] + 1e-4)
-    shape = [-(-side // FLOW_CELL) + 2 for side in luma.shape]
-    chance = torch.randn(2, *shape, generator=generator, device=generator.device).to(picture)
-    chance = F.interpolate(_blur(chance, 2.0)[None], size=luma.shape, mode="bicubic")[0]
     flow = slopes[:2] / (slopes[2] + 1e-9) * known + (1 - known) * chance / (chance.norm(dim=0).mean() + 1e-9)
     flow = 0.8 * flow / (flow.norm(dim=0) + 1e-6)
     asked = torch.cat([fine, wide, _colours(picture), flow])
     return exemplar.scaled(asked), weight, fine + wide
+
+
+def _chance(picture: Tensor, generator: torch.Generator) -> Tensor:
+    """Directions that flow over a picture (C,H,W), (2,H,W)."""
+    shape = picture.shape[-2:]
+    cells = [-(-side // FLOW_CELL) + 2 for side in shape]
+    drawn = torch.randn(2, *cells, generator=generator, device=generator.device).to(picture)
+    return F.interpolate(_blur(drawn, 2.0)[None], size=shape, mode="bicubic")[0]
 
 
 def _transferred(
@@ -200,11 +208,19 @@ def _transferred(
     loss: StyleLoss | None,
     steps: int,
     generator: torch.Generator,
-) -> Tensor:
+    before: tuple[Tensor, Tensor] | None = None,
+    motion: Tensor | None = None,
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """One picture (3,H,W), and its places and chances, which those `before` it are moved to."""
     height, width = picture.shape[-2:]
-    coarsest = LEVELS[0]
-    whole = F.pad(picture[None], (0, -width % coarsest, 0, -height % coarsest), mode="replicate")[0]
-    asked, weight, tone = _asked(whole, exemplar, local, generator)
+    border = (0, -width % LEVELS[0], 0, -height % LEVELS[0])
+    whole = F.pad(picture[None], border, mode="replicate")[0]
+    chance, kept = _chance(whole, generator), None
+    if before is not None and motion is not None:
+        moved = F.pad(motion[None], border, mode="replicate")[0]
+        kept = carried(before[0], torch.full_like(before[0], -1), moved)
+        chance = carried(before[1], chance, moved)
+    asked, weight, tone = _asked(whole, exemplar, local, chance)
     with torch.no_grad():
         unit = max(2 * float(exemplar.picture.flatten(1).var(1).sum()), 1e-4)
         weights = torch.ones_like(asked)
@@ -216,6 +232,8 @@ def _transferred(
             seam=seam / unit,
             joint=JOINT * unit,
             rounds=ROUNDS,
+            kept=kept,
+            keep=KEEP,
             generator=generator,
         )
     book = exemplar.books[-1]
@@ -225,7 +243,7 @@ def _transferred(
     if palette:
         painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
     painted = clip_ste(painted, 0.0, 1.0)[:, :height, :width]
-    return painted if loss is None else _finished(painted, picture, loss, steps)
+    return painted if loss is None else _finished(painted, picture, loss, steps), (places, chance)
 
 
 def _finished(painted: Tensor, scene: Tensor, loss: StyleLoss, steps: int) -> Tensor:
@@ -278,6 +296,7 @@ def texture_transfer(
     palette: float = 1.0,
     turns: int = 8,
     steps: int = 20,
+    motion: Any = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Paint pictures anew with pieces of an exemplar, which lie where tone, direction and colour ask for them.
@@ -300,6 +319,8 @@ def texture_transfer(
                turns: of the exemplar, evenly spread over a whole one; 1 leaves its strokes as they lie.
                steps: down on the loss (`style.StyleLoss`), a third of the time; none where the picture or the exemplar
                has a side of less than 64 pixels.
+               motion: the pictures are frames of a film, and what they show moves by so many pixels (x, y) from each
+               to the next: (2,), (B-1,2), or (B-1,2,H,W) of each pixel of the later one. Strokes move with it.
                generator: of what chance offers; None for torch's default one.
     Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
                and the glaze as far as that is laid over: which piece lies where has no slope.
@@ -331,7 +352,15 @@ def texture_transfer(
         with torch.inference_mode(False):  # what is made there cannot be differentiated through
             loss = StyleLoss(shown.detach().clone(), **FINISH)
     how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "loss": loss, "steps": steps}
-    return torch.stack([_transferred(one, source, **how, generator=generator) for one in picture])
+    if motion is not None:
+        how["motion"], motion = None, motions(motion, picture)
+    painted, before = [], None
+    for index, one in enumerate(picture):
+        if motion is not None and index:
+            how |= {"before": before, "motion": motion[index - 1]}
+        shot, before = _transferred(one, source, **how, generator=generator)
+        painted.append(shot)
+    return torch.stack(painted)
 
 
 def _cropped(exemplar: Tensor) -> Tensor:
@@ -398,15 +427,26 @@ class TextureTransfer(Stage):
         still.seed = 0 if self.seed is None else self.seed
         return still
 
+    def film(self, frames: Tensor, motion: Any, *, generator: torch.Generator | None = None) -> Tensor:
+        """Paint the frames (T,3,H,W) of a film so that strokes move with what they show.
+
+        Args:      motion: from each frame to the next, pixels (x, y): (2,), (T-1,2), or (T-1,2,H,W) of each pixel of
+                   the later one, such as another library's optical flow, backward and negated.
+        Raises:    TypeError, ValueError for a motion of another shape, or one that is not finite.
+        """
+        return self._painted(frames, self.seed, generator, motion)
+
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,3,H,W) sRGB in [0,1] to the same shape."""
+        return self._painted(signal, self.seed, (context or Context()).generator, None)
+
+    def _painted(self, signal: Tensor, seed: int | None, told: torch.Generator | None, motion: Any) -> Tensor:
         check_signal(signal, channels=(3,))
         if signal.ndim != 4 or signal.shape[1] != 3:
             raise ValueError(
                 f"TextureTransfer repaints pictures (B,3,H,W), got shape {tuple(signal.shape)}. Put it behind the "
                 f"ToneCurve.{remedy(signal, name='signal', channels=(3,), ndims=(4,), scaled=False)}"
             )
-        seed, told = self.seed, (context or Context()).generator
         return texture_transfer(
             signal,
             exemplar=self.exemplar,
@@ -419,6 +459,7 @@ class TextureTransfer(Stage):
             palette=self.palette,
             turns=self.turns,
             steps=self.steps,
+            motion=motion,
             generator=told if seed is None else torch.Generator("cpu").manual_seed(seed),
         )
 
