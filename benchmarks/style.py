@@ -85,7 +85,7 @@ def thesis_camera(*, ordinary: bool = False, straight_through: bool = False) -> 
 class Arm:
     """What is trained and how: camera, the loss's arguments, settings. note: for tables. whole: on all of a style.
 
-    pieces: whether the trained camera paints with pieces of what it was trained on.
+    pieces: how the trained camera paints with pieces of what it was trained on, if it does.
     """
 
     note: str
@@ -94,10 +94,10 @@ class Arm:
     settings: Settings
     styles: tuple[str, ...] = field(default=tuple(STYLES))
     whole: bool = False
-    pieces: bool = False
+    pieces: dict[str, Any] | None = None
 
 
-OURS = ("optics", "filter", "convolution", "stage", "pieces")
+OURS = ("optics", "filter", "convolution", "stage", "laid", "pieces")
 QUICK = PRESETS["quick"]
 RATES = QUICK.settings.rates
 CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS, content_aim=None)
@@ -114,6 +114,11 @@ def only(*parts: str) -> Settings:
     return replace(CAMERA, rates={part: RATES[part] for part in parts})
 
 
+def pieces_arm(note: str, **how: Any) -> Arm:
+    preset = PRESETS["pieces"]
+    return Arm(note, preset.camera, preset.loss, preset.settings, pieces=how)
+
+
 ARMS: dict[str, Arm] = {
     "optics": Arm("DOE alone", lambda: style_camera(stage=False), QUICK.loss, only("optics")),
     "filter": Arm("+ colour filter", lambda: style_camera(stage=False), QUICK.loss, only("optics", "filter")),
@@ -124,13 +129,8 @@ ARMS: dict[str, Arm] = {
         only("optics", "filter", "demosaic", "tone"),
     ),
     "stage": Arm("+ a network: kcam train --preset quick", style_camera, QUICK.loss, QUICK.settings),
-    "pieces": Arm(
-        "+ pieces of the painting: kcam train",
-        PRESETS["pieces"].camera,
-        PRESETS["pieces"].loss,
-        PRESETS["pieces"].settings,
-        pieces=True,
-    ),
+    "laid": pieces_arm("+ pieces of the painting, as they are laid", steps=0),
+    "pieces": pieces_arm("+ pieces, and down on the loss: kcam train"),
     "whole": Arm("the network, on all of the painting", style_camera, QUICK.loss, QUICK.settings, whole=True),
     "thesis": Arm("the thesis's arrangement", thesis_camera, THESIS_LOSS, THESIS),
     "thesis, our start": Arm(
@@ -218,8 +218,8 @@ def run(style: str, name: str, work: Path, *, seed: int = 0) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         trained = fit(camera, loss, settings=settings)
-    if arm.pieces:
-        camera = Camera(*camera, isp.TextureTransfer(shown), context=camera.context)
+    if arm.pieces is not None:
+        camera = Camera(*camera, isp.TextureTransfer(shown, **arm.pieces), context=camera.context)
     seconds = time.perf_counter() - began
     pictures = shots(camera)
     folder = folder_of(style, name, work, seed=seed)
@@ -304,7 +304,15 @@ def collect(work: Path) -> None:
         ),
         "style-parts": lambda: plots.contact_sheet(
             [[ordinary[hopper], *(shot(style, part, hopper) for part in OURS)] for style in STYLES],
-            titles=["Ordinary camera", "DOE alone", "+ colour filter", "+ 3x3 and tone", "+ a network", "+ pieces"],
+            titles=[
+                "Ordinary camera",
+                "DOE alone",
+                "+ colour filter",
+                "+ 3x3 and tone",
+                "+ a network",
+                "+ pieces",
+                "+ the loss",
+            ],
             labels=list(STYLES),
         ),
         "style-thesis": lambda: plots.contact_sheet(

@@ -831,13 +831,16 @@ SEEN = {
 }
 
 
+PAINTERS = {"stage": "network", "laid": "pieces as laid", "pieces": "pieces"}
+
+
 def seen_table() -> str:
-    """What the eye sees of shots, of those runs whose pictures it was measured on."""
-    lines = ["| style | seed | " + " | ".join(SEEN.values()) + " |", "|---" * (len(SEEN) + 2) + "|"]
+    """What the eye sees of shots, by what paints."""
+    lines = ["| style | what paints | " + " | ".join(SEEN.values()) + " |", "|---" * (len(SEEN) + 2) + "|"]
     for row in json.loads((RESULTS / "style.json").read_text())["rows"]:
-        if "seen" in row:
+        if row["arm"] in PAINTERS and not row["seed"]:
             values = " | ".join(f"{row['seen'][key]:.2f}" for key in SEEN)
-            lines.append(f"| {row['style']} | {row['seed']} | {values} |")
+            lines.append(f"| {row['style']} | {PAINTERS[row['arm']]} | {values} |")
     return "\n".join(lines)
 
 
