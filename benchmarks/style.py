@@ -97,7 +97,12 @@ class Arm:
     pieces: dict[str, Any] | None = None
 
 
-OURS = ("optics", "filter", "convolution", "stage", "laid", "pieces")
+SHOWN = {
+    "convolution": "The camera alone",
+    "stage": "+ a network",
+    "laid": "+ pieces as laid",
+    "pieces": "+ pieces",
+}
 QUICK = PRESETS["quick"]
 RATES = QUICK.settings.rates
 CAMERA = replace(QUICK.settings, steps=CAMERA_STEPS, content_aim=None)
@@ -303,16 +308,8 @@ def collect(work: Path) -> None:
             labels=[f"kcam train {style}" for style in STYLES],
         ),
         "style-parts": lambda: plots.contact_sheet(
-            [[ordinary[hopper], *(shot(style, part, hopper) for part in OURS)] for style in STYLES],
-            titles=[
-                "Ordinary camera",
-                "DOE alone",
-                "+ colour filter",
-                "+ 3x3 and tone",
-                "+ a network",
-                "+ pieces",
-                "+ the loss",
-            ],
+            [[ordinary[hopper], *(shot(style, part, hopper) for part in SHOWN)] for style in STYLES],
+            titles=["Ordinary camera", *SHOWN.values()],
             labels=list(STYLES),
         ),
         "style-thesis": lambda: plots.contact_sheet(

@@ -18,6 +18,8 @@ from kcam.style import STYLES
 ROOT = Path(__file__).parents[1]
 ALL = json.loads((ROOT / "benchmarks" / "results" / "style.json").read_text())["rows"]
 DOCS = (ROOT / "docs" / "understand" / "style.md").read_text()
+TEXT = " ".join(DOCS.split())
+FILM = json.loads((ROOT / "benchmarks" / "results" / "style_film.json").read_text())["rows"]
 ROWS = [row for row in ALL if row["seed"] == 0]
 AGAIN = [row for row in ALL if row["seed"]]
 
@@ -47,7 +49,7 @@ AIMS = {"training_loss": 0.9, "patch_swd": 0.85, "oriented_texture": 0.55}
 
 
 def check_aims(row: dict[str, Any], *, missed: set[str], left: float = 0.6) -> None:
-    """Of the gaps closed, the mean misses these alone; what is left of the scene is enough on each photograph."""
+    """Of the gaps closed, the mean misses these alone; what is left of the scene is as much on each photograph."""
     assert {name for name, aim in AIMS.items() if row["mean"][name] < aim} == missed
     for name in ("luminance_correlation", "detail_correlation"):
         assert all(photo[name] >= left for photo in row["photographs"].values())
@@ -60,58 +62,90 @@ def missing(row: dict[str, Any], *names: str) -> list[int]:
 
 @pytest.mark.parametrize("style", STYLES)
 def test_what_docs_say_of_the_aims(style: str) -> None:
-    missed = {"training_loss", "patch_swd"} if style == "woodcut" else set()
-    check_aims(committed(style, "stage"), missed=missed)
+    missed = {"woodcut": {"training_loss", "patch_swd"}, "hatching": {"training_loss"}}.get(style, set())
+    row = committed(style, "stage")
+    assert style != "hatching" or row["mean"]["training_loss"] > 0.89  # "by less than 1 %"
+    meets = style in ("strokes", "watercolour")
+    check_aims(row, missed=missed, left=0.6 if meets else 0.37)
+    least = min(photo["detail_correlation"] for photo in row["photographs"].values())
+    assert meets or f"{style} leaves {least:.2f}" in TEXT or f"{style} {least:.2f}" in TEXT
 
 
 def test_what_docs_say_of_seeds() -> None:
     for row in AGAIN:
         if row["arm"] == "stage":
             check_aims(row, missed=set())
-    assert 0.55 <= committed("strokes", "stage")["mean"]["oriented_texture"] < 0.56  # "by less than 1 %"
 
 
 def test_what_docs_say_of_the_woodcut() -> None:
     first, second = missing(committed("woodcut", "stage"), "training_loss", "patch_swd")
-    assert f"misses the first two, by {first} and {second} %" in DOCS
+    assert f"misses the first two, by {first} and {second} %" in TEXT
 
 
 def test_what_docs_say_of_whole_paintings() -> None:
     whole = {style: committed(style, "whole") for style in STYLES}
-    check_aims(whole["watercolour"], missed=set())
-    check_aims(whole["mosaic"], missed=set())
+    for style in ("strokes", "mosaic", "watercolour"):
+        check_aims(whole[style], missed=set())
     assert whole["mosaic"]["mean"]["oriented_texture"] < 0.56  # "by less than 1 %"
-    check_aims(whole["strokes"], missed={"oriented_texture"})
-    assert f"Strokes miss it by {missing(whole['strokes'], 'oriented_texture')[0]} %" in DOCS
-    check_aims(whole["woodcut"], missed={"training_loss", "patch_swd"}, left=0.58)
+    check_aims(whole["woodcut"], missed={"training_loss", "patch_swd"})
     first, second = missing(whole["woodcut"], "training_loss", "patch_swd")
-    assert f"woodcut misses the first two by {first} and {second} %" in DOCS
+    assert f"Woodcut misses the first two by {first} and {second} %" in TEXT
+    check_aims(whole["hatching"], missed={"training_loss"}, left=0.37)
+    assert f"hatching misses the first by {missing(whole['hatching'], 'training_loss')[0]} %" in TEXT
+    check_aims(whole["pointillism"], missed=set(), left=0.5)
+    for style in ("hatching", "pointillism"):
+        assert f"{whole[style]['photographs']['rocket']['detail_correlation']:.2f}" in TEXT
 
 
 PIECES = {"oriented_texture": 0.8, "patch_swd": 0.95, "detail_correlation": 0.75}
 
 
 def test_what_docs_say_of_pieces() -> None:
-    """Ends of what the three seeds of all styles gave, and what each is beside the network's."""
+    """Ends of what the three seeds of all styles gave, and what each is beside the network's and as it is laid."""
     rows = [row for row in ALL if row["arm"] == "pieces"]
     ends = {name: [end(row["mean"][name] for row in rows) for end in (min, max)] for name in rows[0]["mean"]}
     low, high = (round(100 * value) for value in ends["oriented_texture"])
-    assert f"oriented texture {low} to {high} %" in DOCS
+    assert f"oriented texture {low} to {high} %" in TEXT
     low, high = ends["detail_correlation"]
-    assert f"detail {low:.2f} to {high:.2f}" in DOCS
+    assert f"detail {low:.2f} to {high:.2f}" in TEXT
     low, high = (round(100 * value) for value in ends["patch_swd"])
-    assert f"patch SWD {low} to {high} %" in DOCS
+    assert f"patch SWD {low} to {high} %" in TEXT
+    assert max(row["wallpaper"] for row in rows) < 0.025
     for style in STYLES:
-        pieces, network = (committed(style, arm)["mean"] for arm in ("pieces", "stage"))
+        pieces, laid, network = (committed(style, arm)["mean"] for arm in ("pieces", "laid", "stage"))
         assert pieces["oriented_texture"] > network["oriented_texture"] + 0.08
-        assert pieces["detail_correlation"] > network["detail_correlation"] - 0.06
         assert pieces["luminance_correlation"] < network["luminance_correlation"]
+        assert pieces["detail_correlation"] < laid["detail_correlation"]
+        assert all(pieces[name] > laid[name] for name in ("oriented_texture", "patch_swd", "training_loss"))
+        assert committed(style, "pieces")["seen"]["face"] > committed(style, "laid")["seen"]["face"] - 0.005
         own = [row["mean"]["oriented_texture"] for row in rows if row["style"] == style]
         assert max(own) - min(own) < 0.06
-    met = {name: [row["style"] for row in rows if row["mean"][name] >= aim] for name, aim in PIECES.items()}
-    assert met["oriented_texture"] == 3 * ["mosaic"] + 3 * ["woodcut"]
-    assert {style for style in STYLES if met["patch_swd"].count(style) == 3} == {"watercolour"}
-    assert met["detail_correlation"] == 3 * ["strokes"]
+    met = {
+        name: {style for style in STYLES if all(r["mean"][name] >= aim for r in rows if r["style"] == style)}
+        for name, aim in PIECES.items()
+    }
+    assert met["oriented_texture"] == set(STYLES) - {"strokes"}
+    assert met["patch_swd"] == set(STYLES) - {"woodcut"}
+    assert met["detail_correlation"] == {"strokes"}
+    assert min(rows, key=lambda row: row["mean"]["detail_correlation"])["style"] == "hatching"
+
+
+def test_what_docs_say_of_what_is_seen() -> None:
+    seen = {(style, arm): committed(style, arm)["seen"] for style in STYLES for arm in ("stage", "pieces")}
+    assert seen["woodcut", "pieces"]["stroke_length"] < 0.66
+    assert seen["woodcut", "pieces"]["along_across"] > 1.2
+    assert all(0.55 < seen[style, "stage"]["pixel_noise"] < 0.75 for style in STYLES)  # "two thirds"
+    assert all(0.9 < seen[style, "pieces"]["pixel_noise"] < 1.1 for style in STYLES)
+    assert seen["mosaic", "stage"]["stroke_length"] > 1.4
+
+
+def test_what_docs_say_of_films() -> None:
+    assert {row["style"] for row in FILM} == set(STYLES)
+    for name in ("by_themselves", "same_seed"):
+        assert all(0.205 < row[name] < 0.314 for row in FILM)
+    assert all(0.02 < row["film"] < 0.04 for row in FILM)
+    assert all(0.028 < row["frames"] < 0.03 for row in FILM)
+    assert all(abs(row["detail"]["film"] - row["detail"]["by_themselves"]) < 0.01 for row in FILM)
 
 
 def cut_in_tiles(picture: Tensor, side: int = 8) -> Tensor:
@@ -130,17 +164,18 @@ def test_what_docs_say_of_stroke_length_and_palette() -> None:
         length = measures.stroke_length(own)
         noisy = (other + 0.1 * torch.randn(other.shape, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
         assert measures.stroke_length(other) / length == pytest.approx(1, abs=0.08)
-        assert 2.5 < measures.stroke_length(hopper) / length < 10
+        assert 2.5 < measures.stroke_length(hopper) / length < 12.5
         assert 0.25 < measures.stroke_length(cut_in_tiles(other)) / length < 0.65
-        assert measures.stroke_length(noisy) / length < 0.2
+        assert measures.stroke_length(noisy) / length < 0.26
         shots = [
             isp.texture_transfer(
-                hopper[None], exemplar=own, palette=palette, generator=torch.Generator().manual_seed(5)
+                hopper[None], exemplar=own, palette=palette, steps=0, generator=torch.Generator().manual_seed(5)
             )[0]
             for palette in (0.0, 1.0)
         ]
         apart = [measures.patch_swd(shot, own) for shot in (*shots, hopper)]
-        assert apart[1] < 0.8 * apart[0] < 0.8 * apart[2]
+        assert 0.45 < apart[1] / apart[0] < 0.9
+        assert apart[0] < apart[2]
 
 
 @pytest.mark.parametrize("arm", ["stage", "pieces"])
