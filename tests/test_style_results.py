@@ -139,6 +139,19 @@ def test_what_docs_say_of_what_is_seen() -> None:
     assert seen["mosaic", "stage"]["stroke_length"] > 1.4
 
 
+def test_what_docs_say_of_a_fresh_eye() -> None:
+    rows = json.loads((ROOT / "benchmarks" / "results" / "style_eye.json").read_text())["rows"]
+    painted = [row["picture"] for row in rows if row["said"] == "painted"]
+    assert len(rows) == 26
+    assert {name for name in painted if not name.startswith("style-itself")} == {
+        f"{style}-pieces-{photo}" for style in STYLES for photo in ("hopper", "rocket")
+    }
+    assert len(painted) == 14
+    hung = [row["would_hang"] for row in rows if "-pieces-" in row["picture"]]
+    assert (min(hung), max(hung)) == (3, 7)
+    assert sum(row["picture"].startswith(("cv-", "twelve-colours")) for row in rows) == 8
+
+
 def test_what_docs_say_of_films() -> None:
     assert {row["style"] for row in FILM} == set(STYLES)
     for name in ("by_themselves", "same_seed"):
