@@ -335,7 +335,7 @@ class Plan:
         without = [row.effect for row in told if row.chosen == "left out"]
         parts = [*(fewer and [", ".join(fewer)]), *(without and [f"without {', '.join(without)}"])]
         if not parts:
-            return f"nothing left out: all of it takes about {_time(self.seconds)}"
+            return f"nothing left out: optics and sensor take about {_time(self.seconds)}"
         return f"within {self.allowed:.2g}: {'; '.join(parts)}"
 
 

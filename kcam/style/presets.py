@@ -134,7 +134,9 @@ PRESETS: dict[str, Preset] = {
         "the camera alone is trained, and paints with pieces of the style: a minute on a laptop",
         partial(style_camera, stage=False),
         PAINTED,
-        Settings(steps=150, rates={part: rate for part, rate in Settings().rates.items() if part != "stage"}),
+        Settings(
+            steps=150, every=150, rates={part: rate for part, rate in Settings().rates.items() if part != "stage"}
+        ),
         pieces=True,
     ),
     "quick": Preset(
