@@ -30,11 +30,27 @@ def motions(motion: Any, frames: Tensor) -> Tensor:
     return (moved if moved.ndim == 4 else moved[..., None, None]).expand(count, 2, *size)
 
 
+def whole(motion: Tensor) -> Tensor:
+    """Motions (T-1,2,H,W) in whole pixels; what is left of each is added to the next one of what moved, never lost."""
+    found: list[Tensor] = []
+    owed = torch.zeros_like(motion[:1]).squeeze(0) if len(motion) else motion
+    for one in motion:
+        wanted = one + carried(owed, torch.zeros_like(owed), one)
+        found.append(_rounded(wanted))
+        owed = wanted - found[-1]
+    return torch.stack(found) if found else motion
+
+
+def _rounded(values: Tensor) -> Tensor:
+    """Halves up: to even numbers every second pixel of 0.5 would stand still."""
+    return (values + 0.5).floor()
+
+
 def origins(motion: Tensor) -> tuple[Tensor, Tensor]:
     """For each pixel, by its motion (2,H,W), the index of the pixel that it was, (H,W), and whether there was one."""
     height, width = motion.shape[-2:]
     rows, columns = (torch.arange(size, device=motion.device) for size in (height, width))
-    x, y = (columns - motion[0]).round().long(), (rows[:, None] - motion[1]).round().long()
+    x, y = (columns - _rounded(motion[0])).long(), (rows[:, None] - _rounded(motion[1])).long()
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     return y.clamp(0, height - 1) * width + x.clamp(0, width - 1), inside
 
@@ -51,7 +67,7 @@ def anchored(planes: Tensor, motion: Tensor) -> Tensor:
     motion: (T-1,2,H,W) in pixels of a picture that is a whole number of times as large.
     """
     scale = motion.shape[-1] // planes.shape[-1]
-    moved = F.avg_pool2d(motion, scale) / scale
+    moved = whole(F.avg_pool2d(motion, scale) / scale)
     frames = [planes[0]]
     for fresh, one in zip(planes[1:], moved, strict=True):
         frames.append(carried(frames[-1], fresh, one))

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
-from kcam.isp.film import carried, motions
+from kcam.isp.film import carried, motions, whole
 from kcam.isp.pieces import Book, lay_pieces, shown_by, turned
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
 from kcam.srgb import LUMINANCE
@@ -208,16 +208,15 @@ def _transferred(
     loss: StyleLoss | None,
     steps: int,
     generator: torch.Generator,
-    before: tuple[Tensor, Tensor] | None = None,
-    motion: Tensor | None = None,
+    before: tuple[Tensor, Tensor, Tensor] | None,
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """One picture (3,H,W), and its places and chances, which those `before` it are moved to."""
+    """One picture (3,H,W), and its places and chances. before: those of the frame before it, and how it moved since."""
     height, width = picture.shape[-2:]
     border = (0, -width % LEVELS[0], 0, -height % LEVELS[0])
     whole = F.pad(picture[None], border, mode="replicate")[0]
     chance, kept = _chance(whole, generator), None
-    if before is not None and motion is not None:
-        moved = F.pad(motion[None], border, mode="replicate")[0]
+    if before is not None:
+        moved = F.pad(before[2][None], border, mode="replicate")[0]
         kept = carried(before[0], torch.full_like(before[0], -1), moved)
         chance = carried(before[1], chance, moved)
     asked, weight, tone = _asked(whole, exemplar, local, chance)
@@ -338,6 +337,7 @@ def texture_transfer(
     if picture.numel() == 0:
         return picture
     check_exemplar(exemplar)
+    _check_whole(turns=(turns, 1), steps=(steps, 0))
     if not picture.isfinite().all():  # tones are compared with those of the whole picture
         count = int((~picture.isfinite()).sum())
         raise ValueError(
@@ -349,26 +349,28 @@ def texture_transfer(
     source = _Exemplar(shown, turns=turns, detail=detail, flow=flow, colour=colour)
     loss = None
     if steps and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least:
-        with torch.inference_mode(False):  # what is made there cannot be differentiated through
-            loss = StyleLoss(shown.detach().clone(), **FINISH)
+        loss = StyleLoss(shown.detach(), **FINISH)
     how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "loss": loss, "steps": steps}
-    if motion is not None:
-        how["motion"], motion = None, motions(motion, picture)
-    painted, before = [], None
+    moved = None if motion is None else whole(motions(motion, picture))
+    painted: list[Tensor] = []
+    before = None
     for index, one in enumerate(picture):
-        if motion is not None and index:
-            how |= {"before": before, "motion": motion[index - 1]}
-        shot, before = _transferred(one, source, **how, generator=generator)
+        along = None if moved is None or not index else (*before, moved[index - 1])  # type: ignore[misc]
+        shot, before = _transferred(one, source, **how, before=along, generator=generator)
         painted.append(shot)
     return torch.stack(painted)
 
 
 def _cropped(exemplar: Tensor) -> Tensor:
-    """The middle of an exemplar: of a size that all levels divide, and that is not too large."""
-    height, width = exemplar.shape[-2:]
-    shrink = min(1.0, math.sqrt(MOST / (height * width)))
-    tall, broad = (int(side * shrink) // LEVELS[0] * LEVELS[0] for side in (height, width))
-    top, left = (height - tall) // 2, (width - broad) // 2
+    """The middle of an exemplar: of a size that all levels divide, and of which a shorter side stays whole."""
+    sides = list(exemplar.shape[-2:])
+    longer = sides.index(max(sides))
+    shorter = min(sides)
+    sides[longer] = min(sides[longer], max(shorter, MOST // shorter))
+    if shorter**2 > MOST:
+        sides = [min(side, math.isqrt(MOST)) for side in sides]
+    tall, broad = (side // LEVELS[0] * LEVELS[0] for side in sides)
+    top, left = ((size - side) // 2 for size, side in zip(exemplar.shape[-2:], (tall, broad), strict=True))
     return exemplar[:, top : top + tall, left : left + broad]
 
 
@@ -414,9 +416,7 @@ class TextureTransfer(Stage):
             check_not_negative(value, name=name, unit="(0 for nothing)")
         for name, value in (("local", local), ("palette", palette)):
             check_not_negative(value, name=name, unit="(0 for nothing)", most=1.0)
-        for name, number, least in (("turns", turns, 1), ("steps", steps, 0), ("seed", 0 if seed is None else seed, 0)):
-            if isinstance(number, bool) or not isinstance(number, int) or number < least:
-                raise ValueError(f"{name} must be a whole number of at least {least}, got {number!r}.")
+        _check_whole(turns=(turns, 1), steps=(steps, 0), seed=(0 if seed is None else seed, 0))
         hold(self, exemplar=exemplar, glaze=glaze)
         self.detail, self.seam, self.flow, self.colour = detail, seam, flow, colour
         self.local, self.palette, self.turns, self.steps, self.seed = local, palette, turns, steps, seed
@@ -462,6 +462,13 @@ class TextureTransfer(Stage):
             motion=motion,
             generator=told if seed is None else torch.Generator("cpu").manual_seed(seed),
         )
+
+
+def _check_whole(**numbers: tuple[int, int]) -> None:
+    """ValueError for a number that is none or less than its least."""
+    for name, (number, least) in numbers.items():
+        if isinstance(number, bool) or not isinstance(number, int) or number < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {number!r}.")
 
 
 def check_exemplar(exemplar: Tensor) -> None:

@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from kcam.ste import clip_ste
+from kcam.texture.features import GRAY
 from kcam.texture.losses import StyleLoss
 from kcam.threads import no_more_than_free
 
-GRAY = 0.45
 CORNERS = 0.1
 
 

@@ -262,9 +262,10 @@ class StyleLoss(nn.Module):
         self.statistic, self.content_by = statistic, content_by
         self.correlation: dict[str, Any] = {"levels": tuple(levels), "window": window, "whole": whole, "flat": flat}
         self.content_layer = content_layer
-        crops = style_crops(picture, side=crop, multiple=self.features.multiple, least=self.features.least)
-        self.crop = crops.shape[-1]
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is made there cannot be differentiated through
+            own = picture.clone() if isinstance(picture, Tensor) else picture
+            crops = style_crops(own, side=crop, multiple=self.features.multiple, least=self.features.least)
+            self.crop = crops.shape[-1]
             self._remember(crops)
         if content_by == "features" and content_layer not in self.targets:
             raise ValueError(f"unknown content_layer {content_layer!r}; known: {', '.join(self.targets)}.")

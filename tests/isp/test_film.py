@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcam import Scene, isp
-from kcam.isp.film import anchored, carried, motions, origins
+from kcam.isp.film import anchored, carried, motions, origins, whole
 from kcam.style import painting
 
 
@@ -68,10 +69,32 @@ def test_origins_are_the_pixels_that_were() -> None:
     _, inside = origins(motion)
     for y in range(7):
         for x in range(9):
-            v, u = round(y - float(motion[1, y, x])), round(x - float(motion[0, y, x]))
+            v, u = y - math.floor(float(motion[1, y, x]) + 0.5), x - math.floor(float(motion[0, y, x]) + 0.5)
             seen = 0 <= v < 7 and 0 <= u < 9
             assert bool(inside[y, x]) == seen
             assert torch.equal(moved[:, y, x], planes[:, v, u] if seen else fresh[:, y, x])
+
+
+@pytest.mark.parametrize("speed", [0.4, 0.5, 1.4, -0.5, -1.7, 3.0])
+@pytest.mark.parametrize("scale", [1, 4])
+def test_parts_of_pixels_add_up(speed: float, scale: int) -> None:
+    """After twelve frames noise is where it should be, to half of its own pixel, and as white as it was."""
+    frames, side = 13, 240
+    noise = torch.randn(frames, 1, side // scale, side // scale, generator=seeded())
+    motion = motions((speed, 0.0), torch.empty(frames, 3, side, side))
+    last, first = anchored(noise, motion)[-1, 0], noise[0, 0]
+    reach, width = 40 // scale, side // scale
+    middle = first[:, reach:-reach].flatten()
+    alike = {
+        shift: float(
+            torch.corrcoef(torch.stack([last[:, reach + shift : width - reach + shift].flatten(), middle]))[0, 1]
+        )
+        for shift in range(-reach, reach + 1)
+    }
+    assert abs(max(alike, key=alike.__getitem__) - 12 * speed / scale) <= 0.5 + 1e-6
+    beside = torch.corrcoef(torch.stack([last[:, 1:].flatten(), last[:, :-1].flatten()]))[0, 1]
+    assert abs(float(beside)) < 0.2  # with halves to even numbers every second pixel would be its neighbour's
+    assert abs(float(whole(motion).sum(0)[0].mean()) - 12 * speed) <= 0.6
 
 
 def test_coarser_planes_move_by_as_much() -> None:
