@@ -100,7 +100,7 @@ def run(
     folder_of_card: str | os.PathLike[str] | None = None,
     licence: str | None = None,
 ) -> style.Trained:
-    """Train a camera, and write it, its card, sheet and loss curve at every checkpoint, and a report at the end.
+    """Train a camera: sheet and loss curve at every checkpoint; at the end the camera, its card and a report.
 
     Killed at any moment, a run with the same options and `resume` ends in the same camera, bit for bit. Ctrl-C and
     SIGTERM end it after the step, with a checkpoint. Under torchrun the processes share the batch.
@@ -116,7 +116,7 @@ def run(
     files.check_other(out, options.camera)
     card.check_own(out.with_suffix(".md"))
     if folder_of_card is not None:
-        card.check_folder(folder_of_card)
+        card.check_folder(folder_of_card, run=out.with_suffix(""))
     if options.device not in ("cpu", "cuda") or (options.device == "cuda" and not torch.cuda.is_available()):
         raise ValueError(f'cannot train on "{options.device}": expected cpu, or cuda where torch finds a GPU.')
     folder = out.with_suffix("")
@@ -360,9 +360,10 @@ def _card(
     return card.Card(
         f"A camera for {Path(options.style).stem}",
         style=f"{name}, drawn by kcam's own code" if own else name,
-        licence=licence or ("MIT, as kcam's" if own else None),
+        licence=licence or ("MIT" if own else None),
         facts=[(k, Path(v).name if k in ("style", "scenes") else v) for k, v in _facts(options, settings, trained)],
         measures=_measures(loss, pictures),
+        holds=any(isinstance(stage, isp.TextureTransfer) for stage in trained.camera),
         notes=[
             f"Means over {len(pictures)} built-in photographs ({', '.join(SHOWN)}) on which cameras are trained unless "
             "others are given; smaller is nearer. Style and colour are distances from the style, content is what is "
@@ -410,6 +411,7 @@ def _facts(options: Options, settings: Any, trained: style.Trained) -> list[tupl
         ("preset", options.preset),
         ("steps", f"{settings.steps} of {settings.batch} scenes of {settings.size} x {settings.size} pixels"),
         ("scenes", options.patches or options.photos or "built-in photographs"),
+        *((("began with", Path(options.camera).name),) if options.camera else ()),
         ("features", options.features),
         ("time", f"{plots.duration(seconds)}, {plots.duration(seconds / max(1, trained.steps_timed))} a step"),
         *((f"loss: {name}", f"{value:.4f}") for name, value in last.items()),

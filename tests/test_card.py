@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -17,23 +16,29 @@ def told(**changes) -> Card:
         "title": "A camera for night",
         "style": "night | day.png",
         "licence": "CC0-1.0",
-        "facts": [("steps", "3"), ("scenes", "a|b\nc")],
+        "facts": [("steps", "3"), ("scenes", "a|b\n<c>\\|")],
         "measures": [("what", "before", "after"), ("loss: style", "0.9", "0.1")],
         "notes": ["A note."],
     }
     return Card(**(how | changes))
 
 
-@pytest.mark.parametrize("licence", ["CC0-1.0", "CC BY 4.0: mine", '"no": quotes', "[a list]", "-", None])
-def test_the_head_is_plain_yaml(licence: str | None) -> None:
+@pytest.mark.parametrize(
+    "licence", ["CC0-1.0", "MIT", "CC BY 4.0: mine", '"no": quotes', "[a list]", "-", "no", "\x7f", None]
+)
+def test_the_head_is_yaml_of_a_licence_that_hubs_know(licence: str | None) -> None:
+    yaml = pytest.importorskip("yaml")  # of the documentation's tools
     text = told(licence=licence).text("night.safetensors", {})
-    head = text.split("---\n")[1].splitlines()
-    values = dict(line.split(": ", 1) for line in head)
-    assert values["library_name"] == "kcam"
-    own = values["license"]
-    assert (json.loads(own) if own.startswith('"') else own) == (licence or "unknown")
-    assert own.startswith('"') or re.fullmatch(r"[\w.-]+", own)
+    head = yaml.safe_load(text.split("---\n")[1])
+    assert head["library_name"] == "kcam"
+    assert head["license"] in (*card.LICENCES, "other")
+    assert head.get("license_name", head["license"]) == (licence or "unknown").lower()
     assert ("Say whose it is before you pass this camera on" in text) == (licence is None)
+
+
+def test_what_it_says_of_the_painting() -> None:
+    assert "holds all of it" in told(holds=True).text("a.safetensors", {})
+    assert "holds all of it" not in told().text("a.safetensors", {})
 
 
 def test_tables_stay_tables_and_names_are_quoted() -> None:
@@ -64,10 +69,20 @@ def test_a_folder_for_a_hub_holds_no_more_than_it_says(tmp_path: Path) -> None:
 def test_nothing_that_is_no_card_is_replaced(tmp_path: Path) -> None:
     readme = tmp_path / "README.md"
     readme.write_text("# My project")
+    run = tmp_path / "run"
     with pytest.raises(ValueError, match=r"README.md is no model card of kcam's, and would be lost"):
-        card.check_folder(tmp_path)
+        card.check_folder(tmp_path, run=run)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "sheet.png").write_text("mine")
+    with pytest.raises(ValueError, match=r"holds files and no card of kcam's: expected a new or an empty folder"):
+        card.check_folder(tmp_path / "other", run=run)
+    for own in (run, run / "hub"):
+        with pytest.raises(ValueError, match=r"is the run's own folder"):
+            card.check_folder(own, run=run)
+    with pytest.raises(ValueError, match=r"README.md/hub cannot be made: .*Choose another folder"):
+        card.check_folder(readme / "hub", run=run)
     with pytest.raises(ValueError, match=r"would be lost"):
         card.write(told(), tmp_path / "README.safetensors", tmp_path)
     assert readme.read_text() == "# My project"
     with pytest.raises(ValueError, match=r"README.md is a file: expected a folder"):
-        card.check_folder(readme)
+        card.check_folder(readme, run=run)
