@@ -319,10 +319,12 @@ def texture_transfer(
                steps: down on the loss (`style.StyleLoss`), a third of the time; none where the picture or the exemplar
                has a side of less than 64 pixels.
                motion: the pictures are frames of a film, and what they show moves by so many pixels (x, y) from each
-               to the next: (2,), (B-1,2), or (B-1,2,H,W) of each pixel of the later one. Strokes move with it.
+               to the next: (2,), (B-1,2), or (B-1,2,H,W) of each pixel of the later one. Strokes move with it. One that
+               points out of the picture says that a pixel was not in view.
                generator: of what chance offers; None for torch's default one.
     Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
-               and the glaze as far as that is laid over: which piece lies where has no slope.
+               and the glaze as far as that is laid over: which piece lies where has no slope, and the steps pass
+               slopes on as they are. Transforms of torch.func need steps=0.
     Raises:    TypeError, ValueError for what is no picture, NaN, or an exemplar that is too small or flat.
     Source:    Efros and Freeman, Image quilting for texture synthesis and transfer, SIGGRAPH 2001, texture transfer;
                Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns; Reinhard et al., Color

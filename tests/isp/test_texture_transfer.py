@@ -223,6 +223,23 @@ def test_steps_in_inference_mode_and_with_slopes() -> None:
     assert all(bool(slope.isfinite().all()) and float(slope.abs().max()) > 0 for slope in slopes)
 
 
+def test_transforms_without_steps() -> None:
+    exemplar, picture = painting("mosaic", size=64), torch.rand(1, 3, 64, 64, generator=seeded())
+
+    def total(shown: Tensor) -> Tensor:
+        return texture_transfer(shown, exemplar=exemplar, turns=1, steps=0, generator=seeded()).sum()
+
+    shown = picture.clone().requires_grad_()
+    assert torch.allclose(torch.func.grad(total)(picture), torch.autograd.grad(total(shown), shown)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(100, 2000), (64, 9000), (40, 1000), (900, 800)])
+def test_a_long_exemplar_keeps_its_shorter_side(shape: tuple[int, int]) -> None:
+    cropped = transfer._cropped(torch.rand(3, 1, 1).expand(3, *shape))
+    assert min(cropped.shape[1:]) == min(*(side // 8 * 8 for side in shape), 720)
+    assert cropped[0].numel() <= transfer.MOST
+
+
 def test_a_large_picture_is_moved_in_parts_without_seams(monkeypatch) -> None:
     monkeypatch.setattr(transfer, "AT_ONCE", 96)
     for length in (1, 95, 96, 97, 129, 500):

@@ -54,3 +54,15 @@ def test_each_frequency_has_the_scale_of_pictures() -> None:
     assert float(scale.square().mean()) == pytest.approx(1)
     assert float(scale[0, 1] / scale[0, 2]) == pytest.approx(2)
     assert float(scale[16, 20] * math.hypot(0.5, 20 / 48) / scale[0, 1] * 48) == pytest.approx(0.1)
+
+
+def test_rounding_shows() -> None:
+    """As far as limits.md says: Adam's first step is as large where the slope is rounding."""
+    generator = torch.Generator().manual_seed(0)
+    style = painting("strokes", size=160)
+    picture = style[None, :, :96, :96] + 0.0
+    loss = StyleLoss(style, colour=1.0, content=1.0, flat=1e-2)
+    noisy = picture + 1e-7 * torch.randn(picture.shape, generator=generator)
+    one, other = (descend(loss, x, scene=picture, steps=20, rate=0.0075) for x in (picture, noisy))
+    assert float((one - other).abs().max()) < 0.1
+    assert float((one - other).square().mean().sqrt()) < 0.01
