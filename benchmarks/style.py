@@ -346,7 +346,12 @@ def film(style: str) -> dict[str, Any]:
         stage, seeded = isp.TextureTransfer(own), isp.TextureTransfer(own, seed=SEED)
         films = {
             "frames": frames,
-            "by_themselves": torch.cat([stage(frame[None], stage_context(t)) for t, frame in enumerate(frames)]),
+            "by_themselves": torch.cat(
+                [
+                    stage(frame[None], Context(generator=torch.Generator().manual_seed(t)))
+                    for t, frame in enumerate(frames)
+                ]
+            ),
             "same_seed": torch.cat([seeded(frame[None]) for frame in frames]),
             "film": seeded.film(frames, (PAN, 0)),
         }
@@ -360,10 +365,6 @@ def film(style: str) -> dict[str, Any]:
     }
     print(row, flush=True)
     return row
-
-
-def stage_context(seed: int) -> Context:
-    return Context(generator=torch.Generator().manual_seed(seed))
 
 
 def paint_pictures() -> None:

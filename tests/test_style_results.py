@@ -176,7 +176,7 @@ def test_what_docs_say_of_stroke_length_and_palette() -> None:
         own, other = benchmark.halves(style)
         length = measures.stroke_length(own)
         noisy = (other + 0.1 * torch.randn(other.shape, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
-        assert measures.stroke_length(other) / length == pytest.approx(1, abs=0.1)
+        assert measures.stroke_length(other) / length == pytest.approx(1, abs=0.09 if style == "hatching" else 0.08)
         assert 1.9 < measures.stroke_length(hopper) / length < 9.5
         assert 0.25 < measures.stroke_length(cut_in_tiles(other)) / length < 0.65
         assert measures.stroke_length(noisy) / length < 0.2

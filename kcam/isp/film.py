@@ -30,10 +30,10 @@ def motions(motion: Any, frames: Tensor) -> Tensor:
     return (moved if moved.ndim == 4 else moved[..., None, None]).expand(count, 2, *size)
 
 
-def whole(motion: Tensor) -> Tensor:
+def in_whole_pixels(motion: Tensor) -> Tensor:
     """Motions (T-1,2,H,W) in whole pixels; what is left of each is added to the next one of what moved, never lost."""
     found: list[Tensor] = []
-    owed = torch.zeros_like(motion[:1]).squeeze(0) if len(motion) else motion
+    owed = motion.new_zeros(motion.shape[1:])
     for one in motion:
         wanted = one + carried(owed, torch.zeros_like(owed), one)
         found.append(_rounded(wanted))
@@ -67,7 +67,7 @@ def anchored(planes: Tensor, motion: Tensor) -> Tensor:
     motion: (T-1,2,H,W) in pixels of a picture that is a whole number of times as large.
     """
     scale = motion.shape[-1] // planes.shape[-1]
-    moved = whole(F.avg_pool2d(motion, scale) / scale)
+    moved = in_whole_pixels(F.avg_pool2d(motion, scale) / scale)
     frames = [planes[0]]
     for fresh, one in zip(planes[1:], moved, strict=True):
         frames.append(carried(frames[-1], fresh, one))

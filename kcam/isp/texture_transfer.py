@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
-from kcam.isp.film import carried, motions, whole
+from kcam.isp.film import carried, in_whole_pixels, motions
 from kcam.isp.pieces import Book, lay_pieces, shown_by, turned
 from kcam.sensor.noise import check_not_negative, hold, in_float32, like
 from kcam.srgb import LUMINANCE
@@ -353,7 +353,7 @@ def texture_transfer(
     if steps and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least:
         loss = StyleLoss(shown.detach(), **FINISH)
     how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "loss": loss, "steps": steps}
-    moved = None if motion is None else whole(motions(motion, picture))
+    moved = None if motion is None else in_whole_pixels(motions(motion, picture))
     painted: list[Tensor] = []
     before = None
     for index, one in enumerate(picture):
@@ -365,13 +365,8 @@ def texture_transfer(
 
 def _cropped(exemplar: Tensor) -> Tensor:
     """The middle of an exemplar: of a size that all levels divide, and of which a shorter side stays whole."""
-    sides = list(exemplar.shape[-2:])
-    longer = sides.index(max(sides))
-    shorter = min(sides)
-    sides[longer] = min(sides[longer], max(shorter, MOST // shorter))
-    if shorter**2 > MOST:
-        sides = [min(side, math.isqrt(MOST)) for side in sides]
-    tall, broad = (side // LEVELS[0] * LEVELS[0] for side in sides)
+    shorter = min(*exemplar.shape[-2:], math.isqrt(MOST))
+    tall, broad = (min(side, MOST // shorter) // LEVELS[0] * LEVELS[0] for side in exemplar.shape[-2:])
     top, left = ((size - side) // 2 for size, side in zip(exemplar.shape[-2:], (tall, broad), strict=True))
     return exemplar[:, top : top + tall, left : left + broad]
 
@@ -436,13 +431,13 @@ class TextureTransfer(Stage):
                    the later one, such as another library's optical flow, backward and negated.
         Raises:    TypeError, ValueError for a motion of another shape, or one that is not finite.
         """
-        return self._painted(frames, self.seed, generator, motion)
+        return self._painted(frames, generator, motion)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,3,H,W) sRGB in [0,1] to the same shape."""
-        return self._painted(signal, self.seed, (context or Context()).generator, None)
+        return self._painted(signal, (context or Context()).generator, None)
 
-    def _painted(self, signal: Tensor, seed: int | None, told: torch.Generator | None, motion: Any) -> Tensor:
+    def _painted(self, signal: Tensor, told: torch.Generator | None, motion: Any) -> Tensor:
         check_signal(signal, channels=(3,))
         if signal.ndim != 4 or signal.shape[1] != 3:
             raise ValueError(
@@ -462,7 +457,7 @@ class TextureTransfer(Stage):
             turns=self.turns,
             steps=self.steps,
             motion=motion,
-            generator=told if seed is None else torch.Generator("cpu").manual_seed(seed),
+            generator=told if self.seed is None else torch.Generator("cpu").manual_seed(self.seed),
         )
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcam import Scene, isp
-from kcam.isp.film import anchored, carried, motions, origins, whole
+from kcam.isp.film import anchored, carried, in_whole_pixels, motions, origins
 from kcam.style import painting
 
 
@@ -94,7 +94,7 @@ def test_parts_of_pixels_add_up(speed: float, scale: int) -> None:
     assert abs(max(alike, key=alike.__getitem__) - 12 * speed / scale) <= 0.5 + 1e-6
     beside = torch.corrcoef(torch.stack([last[:, 1:].flatten(), last[:, :-1].flatten()]))[0, 1]
     assert abs(float(beside)) < 0.2  # with halves to even numbers every second pixel would be its neighbour's
-    assert abs(float(whole(motion).sum(0)[0].mean()) - 12 * speed) <= 0.6
+    assert abs(float(in_whole_pixels(motion).sum(0)[0].mean()) - 12 * speed) <= 0.6
 
 
 def test_coarser_planes_move_by_as_much() -> None:

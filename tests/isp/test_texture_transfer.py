@@ -44,11 +44,11 @@ def between(one: float, other: float) -> float:
 def test_a_picture_is_made_of_colours_of_the_exemplar() -> None:
     levels = torch.tensor([0.1, 0.5, 0.9])
     exemplar = levels[torch.arange(64) % 12 // 4].expand(3, 64, 64)
-    plain: Any = {"glaze": 0.0, "palette": 0.0, "turns": 1}
+    plain: Any = {"glaze": 0.0, "palette": 0.0, "turns": 1, "detail": 4.0}
     picture = torch.rand(1, 3, 40, 48, generator=seeded(1))
     painted = texture_transfer(picture, exemplar=exemplar, generator=seeded(), **plain)
     apart = (painted[..., None] - levels).abs().amin(-1)
-    assert float((apart < 1e-5).float().mean()) > 0.5  # the others are where two pieces meet
+    assert float((apart < 1e-5).float().mean()) > 0.7  # the others are where two pieces meet
     assert float(painted.min()) >= 0.1 - 1e-5
     assert float(painted.max()) <= 0.9 + 1e-5
 

@@ -123,8 +123,7 @@ def blocks(values: np.ndarray, side: int = 16) -> np.ndarray:
     return functional.avg_pool2d(torch.from_numpy(values)[None, None], side)[0, 0].numpy()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["strokes", "woodcut", "hatching"])
+@pytest.mark.parametrize("name", ["strokes", "woodcut", pytest.param("hatching", marks=pytest.mark.slow)])
 def test_strokes_follow_their_swirls(name, paintings):
     """Directed: the local structure tensor is far more coherent than that of noise of the same spectrum."""
     gray = paintings[name].mean(0).double().numpy()
