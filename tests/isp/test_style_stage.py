@@ -328,11 +328,11 @@ def test_float64_weights_take_float32_pictures() -> None:
     assert painted(painting_stage(**SMALL).double(), random_picture(1, 3, 8, 8)).dtype == torch.float32
 
 
-def test_autocast(device: torch.device) -> None:
+def test_autocast(hardware: torch.device) -> None:
     """Type of the picture, values to what bfloat16 resolves."""
-    stage, picture = painting_stage(**SMALL).to(device), random_picture(1, 3, 24, 28).to(device)
+    stage, picture = painting_stage(**SMALL).to(hardware), random_picture(1, 3, 24, 28).to(hardware)
     expected = painted(stage, picture)
-    with torch.autocast(device.type, dtype=torch.bfloat16):
+    with torch.autocast(hardware.type, dtype=torch.bfloat16):
         result = painted(stage, picture)
     assert result.dtype == torch.float32
     assert (result - expected).abs().mean() < 0.01  # 8 bits of mantissa, 2 to 3 levels of 8 bits

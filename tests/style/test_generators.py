@@ -94,9 +94,9 @@ def test_two_steps_never_share_the_seed_that_torch_reads():
     assert len(seeds) == 50_000
 
 
-def test_torch_on_a_device(device: torch.device):
-    one, two = (torch.rand(8, generator=torch_generator(3, 4, device=device), device=device) for _ in range(2))
-    assert torch_generator(3, 4, device=device).device.type == device.type
+def test_torch_on_a_device(hardware: torch.device):
+    one, two = (torch.rand(8, generator=torch_generator(3, 4, device=hardware), device=hardware) for _ in range(2))
+    assert torch_generator(3, 4, device=hardware).device.type == hardware.type
     assert torch.equal(one, two)
 
 

@@ -149,15 +149,15 @@ def test_fingerprint_is_the_files(file: Path, features: VGG16Features):
     assert features.name == f"vgg16-{digest[:8]}"
 
 
-def test_mixed_precision(file: Path, features: VGG16Features, device: torch.device):
+def test_mixed_precision(file: Path, features: VGG16Features, hardware: torch.device):
     picture = pictures(1, 3, 64, 64)
     exact = features(picture)
     for precision in (None, "bfloat16"):
-        found = VGG16Features(file, precision=precision).to(device)(picture.to(device))
+        found = VGG16Features(file, precision=precision).to(hardware)(picture.to(hardware))
         for name, layer in found.items():
             error = (layer.cpu() - exact[name]).abs().max() / exact[name].max()
             assert layer.dtype == torch.float32
-            if precision is None and device.type == "cpu":
+            if precision is None and hardware.type == "cpu":
                 assert error == 0
             else:
                 # bfloat16 has 8 bits: half a step is 2e-3, ten layers deep 4e-3 to 8e-3 measured

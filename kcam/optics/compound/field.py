@@ -56,7 +56,7 @@ class FieldPSFs:
 
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
         """Of others (L,) [m] in the same range; see `source.FieldPSFs`."""
-        return replace(self, wavelengths=wavelengths.to(torch.float64), lateral_colour=lateral_colour)
+        return replace(self, wavelengths=wavelengths.to("cpu", torch.float64), lateral_colour=lateral_colour)
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
@@ -96,6 +96,7 @@ class FieldPSFs:
         return Banks(self._bank, self.wavelengths, self.reach)
 
     def _bank(self, places: Tensor, wavelengths: Tensor, pixels: PixelGrid, whole: bool) -> Tensor:
+        places = places.cpu()
         radii = places.norm(dim=1)
         away = radii.clamp(min=1e-150)[:, None]
         towards = torch.where(radii[:, None] > 0, places / away, places.new_tensor([0.0, 1.0]))
@@ -112,7 +113,7 @@ class FieldPSFs:
     def deviations(self, pixels: PixelGrid, *, colours: float = math.inf) -> dict[str, float]:
         """What PSFs may be off by, of their light: see `field.FieldEstimate`."""
         places = torch.tensor([[0.0, 0.0], [0.54, 0.72]], dtype=torch.float64) * self.reach
-        psfs = self.bank(places, pixels, colours=colours)
+        psfs = self.bank(places, pixels, colours=colours).cpu()
         radii = places.norm(dim=1)
         fitted = self._fitted(radii, self.wavelengths)
         frame = Frame.upright(fitted)

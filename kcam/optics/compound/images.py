@@ -265,8 +265,12 @@ def images(
         for part in torch.tensor(indices).split(max(1, _AT_ONCE // length**2)):
             own = frame[part]
             count = min(length, 2 * math.ceil(float(own.half.max()) / spacing) + _ROOM)
-            path, clearances = _known(fitted, nodes[part], own, spacing * (count / 2), offsets[part])
-            chebyshev_points, matrix = (part.to(path.device) for part in _from_chebyshev(fitted.degree, count))
+            known = _known(fitted, nodes[part], own, spacing * (count / 2), offsets[part])
+            # from here on each of the PSF's points is computed, where the picture is
+            path, clearances, chebyshev_points, matrix, unit = (
+                values.to(pixels.device)
+                for values in (*known, *_from_chebyshev(fitted.degree, count), relative_to[part])
+            )
             low = matrix.to(pixels.dtype)
             openings = Openings(edge_distance(low @ _limiting(clearances[:, colours]).to(pixels.dtype) @ low.mT))
             lights = []
@@ -282,7 +286,7 @@ def images(
                 if not pixels.integrate:
                     image = _every(image, int(per_pixel))
                 light = Pixels(pixels.shape, points_per_pixel, integrate=pixels.integrate).of_image(image)
-                factor = spacing**2 / relative_to[part, index]
+                factor = spacing**2 / unit[:, index]
                 if whole:
                     factor = factor * passed.sum((-2, -1)) / light.sum((-2, -1))
                 else:

@@ -155,6 +155,15 @@ class CompoundLens(nn.Module):
         """Refractive index in front of the lens and behind each surface, K + 1 of (L,) float64."""
         return [torch.ones_like(wavelengths), *(surface.index(wavelengths) for surface in self.surfaces)]
 
+    @property
+    def _stop_semi_diameter(self) -> Tensor:
+        return float64(self.surfaces[self.stop].semi_diameter).cpu()  # type: ignore[arg-type]
+
+    @property
+    def _sensor_away(self) -> Tensor:
+        """From the last vertex [m]."""
+        return float64(self.sensor_distance).cpu()
+
     def first_order(self, wavelength: float | None = None) -> FirstOrder:
         """Focal length and pupils [m] at a wavelength [m]; None for that of focus."""
         grid = wavelength_grid([self.focus_wavelength if wavelength is None else wavelength])
@@ -163,7 +172,7 @@ class CompoundLens(nn.Module):
         front = system_matrix(self.surfaces[: self.stop + 1], indices, refract_last=False)
         # behind the stop: from its vertex, which refracts, to the last
         back = system_matrix(self.surfaces[self.stop :], indices[self.stop :])
-        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        semi = self._stop_semi_diameter
         return FirstOrder(
             focal_length=-1 / matrix[1, 0],
             back_focus=-matrix[0, 0] / matrix[1, 0],
@@ -181,7 +190,7 @@ class CompoundLens(nn.Module):
     def f_number(self) -> float:
         """Working f-number: from the exit pupil to the sensor, over its width."""
         first = self.first_order()
-        distance = float64(self.sensor_distance) - first.exit_pupil
+        distance = self._sensor_away - first.exit_pupil
         return float((distance / (2 * first.exit_semi_diameter)).detach())
 
     def _focused(self, distance: float) -> float:
@@ -208,7 +217,7 @@ class CompoundLens(nn.Module):
         Args: heights: Y / D. vergences: 1 / distance from the first vertex [1/m]. px, py: [m]; all broadcast.
             entrance: where that pupil is [m], where it is known: see `first_order`.
         """
-        e = (self.first_order().entrance_pupil if entrance is None else entrance).to(px.device)
+        e = self.first_order().entrance_pupil if entrance is None else entrance
         v = vergences / (1 + vergences * e)  # from the entrance pupil
         sx, sy = px * v, py * v - heights
         n = torch.rsqrt(1 + sx**2 + sy**2)
@@ -265,7 +274,7 @@ class CompoundLens(nn.Module):
 
     def _chiefs(self, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> _Nodes:
         """The same where some may be lost: `chief.alive` says which are not."""
-        indices = [index.to(heights.device)[None, None, :, None] for index in self.indices(wavelengths)]
+        indices = [index[None, None, :, None] for index in self.indices(wavelengths)]
         t, v = heights[:, None, None, None], vergences[None, :, None, None]
         aim, across, along = self.aimed(t, v, indices)
         chief = self._at_sensor(self.launch(t, v, torch.zeros_like(aim), aim), indices)
@@ -279,7 +288,7 @@ class CompoundLens(nn.Module):
         y and y^2 beside the chief ray's height, (..., 3) [m]. By rays to points `_INNER` of the radius from its middle.
         """
         first = self.first_order()
-        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        semi = self._stop_semi_diameter
         beside = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64, device=aim.device)
         above = torch.tensor([0.0, 1.0, -1.0], dtype=torch.float64, device=aim.device)
         x, y = _INNER * semi * beside / across, _INNER * semi * above / along
@@ -298,7 +307,7 @@ class CompoundLens(nn.Module):
 
     def _at_sensor(self, rays: Rays, indices: list[Tensor]) -> Rays:
         rays = trace(self.surfaces, rays, indices)
-        t = float64(self.sensor_distance).to(rays.x.device) / rays.dz
+        t = self._sensor_away / rays.dz
         return replace(rays, x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, path=rays.path + t)
 
     @no_more_than_free()
@@ -320,7 +329,7 @@ class CompoundLens(nn.Module):
         asked = self._asked(wavelengths, distances, field)
         nodes = self._nodes(asked.wavelengths, asked.vergences, asked.heights)
         chief = nodes.chief
-        semi = float64(self.surfaces[self.stop].semi_diameter)  # type: ignore[arg-type]
+        semi = self._stop_semi_diameter
         side = torch.linspace(-1, 1, samples, dtype=torch.float64)
         x, y = (part.flatten() for part in torch.meshgrid(side, side, indexing="xy"))
         # the stop's own axes turn with the field
@@ -336,7 +345,7 @@ class CompoundLens(nn.Module):
                     break
                 px, py = px - (at.x - to_x) / nodes.across, py - (at.y - to_y) / nodes.along
         rays = self._at_sensor(self.launch(nodes.heights, nodes.vergences, px, py), nodes.indices)
-        away = float64(self.sensor_distance) - self.first_order().exit_pupil
+        away = self._sensor_away - self.first_order().exit_pupil
         radius = away.sign() * torch.sqrt(away**2 + chief.y**2)
         ox, oy = rays.x - chief.x, rays.y - chief.y
         onto = ox * rays.dx + oy * rays.dy
@@ -443,14 +452,14 @@ class CompoundLens(nn.Module):
         """Vergence of what the sensor is focused on [1/m]; 0 where that lies beyond infinity."""
         indices = [index[0] for index in self.indices(wavelength_grid([wavelength or self.focus_wavelength]))]
         (a, b), (c, d) = system_matrix(self.surfaces, indices)
-        away = float64(self.sensor_distance)
+        away = self._sensor_away
         return (-(a + away * c) / (b + away * d)).clamp(min=0)
 
     @property
     def image_scale(self) -> Tensor:
         """Height of the image of a point near the axis over the point's own (Y / D) [m]."""
         first = self.first_order()
-        away = float64(self.sensor_distance) - first.exit_pupil
+        away = self._sensor_away - first.exit_pupil
         return away * first.entrance_semi_diameter / first.exit_semi_diameter
 
     def aperture_area(self) -> float:
@@ -465,7 +474,7 @@ class CompoundLens(nn.Module):
     def bank(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> Tensor:
         """PSFs (N, L, h, w) of source points, on the axis unless they have positions: see `PSFSource`."""
         places = torch.zeros(len(points.vergences), 2) if points.positions is None else points.positions
-        places = places.to(torch.float64)
+        places = places.to("cpu", torch.float64)
         field = self.over_field(float(places.norm(dim=1).max()), points.vergences, wavelengths)
         if points.positions is None:
             return field.bank(places[:1], pixels)[0]
@@ -531,27 +540,28 @@ class CompoundLens(nn.Module):
         [m].
         """
         self.check()
+        vergences, wavelengths = (values.to("cpu", torch.float64) for values in (vergences, wavelengths))
         heights = self._heights_cache.get((self, reach), lambda: self.image_heights(reach))
         square = torch.tensor(reach, dtype=torch.float64) ** 2
         highest = reach * float(heights.over_radius.at(square).detach())
         table = tabulate(
             lambda t, v, colours: self.pupils(colours, v, t),
             highest=highest,
-            vergences=vergences.to(torch.float64),
-            wavelengths=wavelengths.to(torch.float64),
+            vergences=vergences,
+            wavelengths=wavelengths,
         )
-        return FieldPSFs(table, heights, vergences.to(torch.float64), wavelengths.to(torch.float64), reach)
+        return FieldPSFs(table, heights, vergences, wavelengths, reach)
 
     def _asked(self, wavelengths: Tensor | list[float], distances: Tensor | float, field: Tensor | None) -> _Asked:
         self.check()
         points = torch.zeros(1, 2, dtype=torch.float64)
         if field is not None:
-            points = as_values(field, name="field", unit="X / D, Y / D").to(torch.float64)
+            points = as_values(field, name="field", unit="X / D, Y / D").to("cpu", torch.float64)
         if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not bool(points.isfinite().all()):
             raise ValueError(f"field must be finite, (F, 2) of X / D and Y / D, got shape {tuple(points.shape)}.")
         heights = points.square().sum(1).clamp(min=1e-300).sqrt() * (points != 0).any(1)
         away = torch.where(heights[:, None] > 0, points / heights.clamp(min=1e-150)[:, None], points.new_tensor([0, 1]))
-        return _Asked(wavelength_grid(wavelengths), 1 / check_distances(distances).reshape(-1), heights, away)
+        return _Asked(wavelength_grid(wavelengths), 1 / check_distances(distances).reshape(-1).cpu(), heights, away)
 
     # ---- analysis --------------------------------------------------------------------------------------------------
 

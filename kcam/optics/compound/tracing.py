@@ -129,9 +129,9 @@ def system_matrix(surfaces: Sequence[Surface], indices: Sequence[Tensor], *, ref
     matrix = torch.eye(2, dtype=torch.float64)
     for k, surface in enumerate(surfaces):
         if k < len(surfaces) - 1 or refract_last:
-            power = (indices[k + 1] - indices[k]) * surface.vertex_curvature
+            power = (indices[k + 1] - indices[k]) * surface.vertex_curvature.cpu()
             matrix = torch.stack([torch.stack([one, zero]), torch.stack([-power, one])]) @ matrix
         if k < len(surfaces) - 1:
-            reduced = float64(surface.thickness) / indices[k + 1]
+            reduced = float64(surface.thickness).cpu() / indices[k + 1]
             matrix = torch.stack([torch.stack([one, reduced]), torch.stack([zero, one])]) @ matrix
     return matrix
