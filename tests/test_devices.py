@@ -95,6 +95,10 @@ def picture(*shape: int) -> Tensor:
 STAGES: dict[str, Callable[[], nn.Module]] = {
     "style stage": lambda: painting_stage().mean(),
     "texture transfer": lambda: isp.TextureTransfer(style.painting("strokes", size=64), seed=0, steps=2),
+    "learned demosaic": lambda: nn.Sequential(sensor.Mosaic("RGGB"), isp.LearnedDemosaic()),
+    "malvar": lambda: nn.Sequential(sensor.Mosaic("RGGB"), isp.Demosaic("malvar", pattern="RGGB")),
+    "menon": lambda: nn.Sequential(sensor.Mosaic("RGGB"), isp.Demosaic("menon", pattern="RGGB")),
+    "convolution": isp.Convolution,
     "denoise": isp.Denoise,
     "sharpen": isp.Sharpen,
     "local tones": isp.LocalToneMapping,

@@ -1,0 +1,247 @@
+"""kcam on a GPU: pictures and plans, a training step, augmentations, styles; each time beside its error and the CPU's.
+
+    python -m benchmarks.gpu               about six minutes on an H100; writes benchmarks/results/gpu.json
+    python -m benchmarks.gpu --device cpu --quick     toy sizes: checks that everything runs
+
+Times are wall seconds between two synchronisations, the median of some calls after a warm-up. The CPU's are of the
+machine that the GPU is in, with all the threads that kcam takes there; where they would take long, of one call. Errors
+are the raw picture's relative RMS without noise: of the GPU's reference from the CPU's, of plans from the reference
+where they run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+import kcam.augmentation as KC
+from benchmarks.common import ROOT, environment, write_json
+from benchmarks.style_step import random_vgg16
+from kcam import Camera, Scene, isp, optics, sensor, style
+from kcam.planner import noiseless_raw, relative_rms
+from kcam.planner.planner import fresh
+from kcam.units import mm, um
+
+RESULTS = ROOT / "benchmarks" / "results" / "gpu.json"
+TOLERANCES = (0.03, 0.01, 0.003)
+LONG = 2.0  # seconds of a call above which one must do
+ROUNDS = 5
+Row = dict[str, Any]
+PARTS = ("pictures", "augmentations", "styles", "training")
+
+
+def seconds(call: Callable[[], Any], *, device: torch.device, most: float = LONG) -> float:
+    """Wall seconds of a call, the median of `ROUNDS` after one that warms up; of one where that took long."""
+
+    def once() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        start = time.perf_counter()
+        call()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter() - start
+
+    first = once()
+    return first if first > most else statistics.median(once() for _ in range(ROUNDS))
+
+
+# ---- pictures ------------------------------------------------------------------------------------------------------
+
+
+def cases(quick: bool) -> dict[str, tuple[Camera, Scene]]:
+    """Cameras and scenes, small ones to large ones."""
+
+    def scene(name: str, side: int) -> Scene:
+        return Scene.builtin(name, 32 if quick else side)
+
+    trained = optics.DOE(style.presets.smooth_phase(64) * 40)
+    doe = optics.Lens(
+        optics.CircularAperture(5 * mm), optics.PlanoConvexLens(25.8 * mm, glass="N-BK7"), trained, focus_distance=1.0
+    )
+    real = optics.CompoundLens.preset("cooke_triplet", focus_distance=2.0)
+    bayer = [sensor.ColourFilter.kodak(), sensor.Mosaic("RGGB"), sensor.Exposure(), isp.Demosaic(), isp.ToneCurve()]
+    return {
+        "phone camera": (Camera.phone(), scene("coffee", 1024).with_depth(2.0)),
+        "the thesis's camera": (Camera.thesis(), scene("coffee", 256).with_depth(2.0)),
+        "singlet and DOE, a depth map": (
+            Camera(optics.Imaging(doe, pixel_pitch=4 * um), *bayer),
+            scene("motorcycle", 512),
+        ),
+        "real lens over the field": (
+            Camera(optics.Imaging(real, pixel_pitch=4 * um), *bayer),
+            scene("astronaut", 512).with_depth(2.0),
+        ),
+    }
+
+
+def pictures(device: torch.device, quick: bool) -> list[Row]:
+    rows = []
+    for name, (camera, scene) in cases(quick).items():
+        with torch.no_grad():
+            here = noiseless_raw(camera)(scene)
+            camera_there, scene_there = camera.to(device), scene.to(device)
+
+            def shot(chosen: Camera, scene: Scene = scene_there) -> Tensor:
+                """With new optics, of which nothing is kept."""
+                return noiseless_raw(Camera(*(fresh(stage) for stage in chosen), context=chosen.context))(scene)
+
+            reference = shot(camera_there)
+            row = {
+                "camera": name,
+                "pixels": list(scene.shape[-2:]),
+                "plan": "reference",
+                "error": relative_rms(reference.cpu(), here),
+                "gpu": seconds(lambda: shot(camera_there), device=device),  # noqa: B023: called at once
+            }
+            rows.append(row)
+            for tolerance in TOLERANCES:
+                start = time.perf_counter()
+                plan = camera_there.plan(scene_there, tolerance=tolerance)
+                planning = time.perf_counter() - start
+                planned = plan.apply(camera_there)
+                rows.append(
+                    {
+                        "camera": name,
+                        "pixels": list(scene.shape[-2:]),
+                        "plan": f"tolerance {tolerance:g}",
+                        "changes": str(plan.changes),
+                        "error": relative_rms(shot(planned), reference),
+                        "gpu": seconds(lambda: shot(planned), device=device),  # noqa: B023
+                        "planning": planning,
+                    }
+                )
+            cpu = torch.device("cpu")
+            camera_here, scene_here = camera.to(cpu), scene.to(cpu)
+            row["cpu"] = seconds(lambda: shot(camera_here, scene_here), device=cpu, most=0.5)  # noqa: B023
+            camera_there = camera.to(device)
+        light = scene_there.coefficients if scene_there.spectra is None else scene_there.spectra
+        light.requires_grad_()
+        row["gradient"] = seconds(lambda: shot(camera_there).square().mean().backward(), device=device)  # noqa: B023
+    return rows
+
+
+# ---- augmentations -------------------------------------------------------------------------------------------------
+
+
+def augmentations(device: torch.device, quick: bool) -> list[Row]:
+    """A batch of 64 pictures of 224 x 224, ranges as they are by default."""
+    shape = (2, 3, 32, 32) if quick else (64, 3, 224, 224)
+    batch = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    there, rows = batch.to(device), []
+    for name in KC.__all__:
+        if not name.startswith("Random") or name in ("RandomCamera", "RandomLens"):
+            continue
+        augmentation = getattr(KC, name)(p=1.0)
+        with torch.no_grad():
+            gpu = seconds(lambda: augmentation(there), device=device)  # noqa: B023
+            cpu = seconds(lambda: augmentation(batch), device=torch.device("cpu"), most=0.3)  # noqa: B023
+        rows.append({"augmentation": name, "shape": list(shape), "gpu": gpu, "cpu": cpu})
+    return rows
+
+
+# ---- styles --------------------------------------------------------------------------------------------------------
+
+
+def styles(device: torch.device, quick: bool) -> list[Row]:
+    """A shot with pieces, a painted picture, and whole commands."""
+    side = 64 if quick else 512
+    photo = Scene.builtin("astronaut", side).to_srgb().to(device)
+    picture = style.painting("strokes", size=side).to(device)
+    rows: list[Row] = []
+    stage = isp.TextureTransfer(picture, seed=0).to(device)
+    with torch.no_grad():
+        rows.append(
+            {"what": f"shot of {side} x {side} with pieces", "gpu": seconds(lambda: stage(photo), device=device)}
+        )
+    loss = style.StyleLoss(picture).to(device)
+    steps = 2 if quick else 200
+    rows.append(
+        {
+            "what": f"kcam paint, {steps} steps at {side} x {side}",
+            "gpu": seconds(lambda: style.paint(loss, photo=photo[0], steps=steps), device=device, most=0.0),
+        }
+    )
+    for preset in ("pieces", "quick", "standard"):
+        rows.append(
+            {"what": f"kcam train --preset {preset}"} | train(device, preset, *(["--steps", "2"] if quick else []))
+        )
+    return rows
+
+
+def train(device: torch.device, preset: str, *arguments: str) -> Row:
+    """The whole command from start to file."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "camera.safetensors"
+        command = [sys.executable, "-m", "kcam", "train", "strokes", "--preset", preset, "--device", device.type]
+        start = time.perf_counter()
+        done = subprocess.run([*command, "--out", str(out), *arguments], capture_output=True, text=True, check=False)
+        took = time.perf_counter() - start
+        if done.returncode or not out.exists():
+            return {"error": (done.stdout + done.stderr)[-2000:]}
+    return {"gpu": took}
+
+
+# ---- training at the thesis's size ---------------------------------------------------------------------------------
+
+
+def training(device: torch.device, quick: bool) -> list[Row]:
+    """Steps of preset `thesis`: two crops of 256 x 256 and 28 bands, an 891 x 891 DOE, VGG16 of random weights."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        weights = Path(folder) / "vgg16.pth"
+        random_vgg16(weights)
+        for count in (1, 3) if quick else (20, 120):
+            how = ["--features", "vgg16", "--vgg-weights", str(weights), "--steps", str(count)]
+            rows.append({"what": f"kcam train --preset thesis, {count} steps"} | train(device, "thesis", *how))
+    if all("gpu" in row for row in rows):
+        rows.append({"what": "a step", "gpu": (rows[1]["gpu"] - rows[0]["gpu"]) / (2 if quick else 100)})
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--only", default=",".join(PARTS))
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    given = parser.parse_args()
+    device, console = torch.device(given.device), Console(width=150)
+    found: dict[str, Any] = {"environment": environment()}
+    if device.type == "cuda":
+        found["environment"]["gpu"] = torch.cuda.get_device_name()
+    for part in given.only.split(","):
+        start = time.perf_counter()
+        try:
+            found[part] = globals()[part](device, given.quick)
+        except Exception as error:  # what was measured before is worth keeping
+            console.print_exception()
+            found[part] = [{"error": repr(error)}]
+        write_json(given.out, found)  # a lease may end at any moment
+        table = Table(title=f"{part}, {time.perf_counter() - start:.0f} s", box=None, title_justify="left")
+        names = list(dict.fromkeys(name for row in found[part] for name in row))
+        for name in names:
+            table.add_column(name)
+        for row in found[part]:
+            table.add_row(*(_text(row.get(name)) for name in names))
+        console.print(table, "")
+
+
+def _text(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else "" if value is None else str(value)[:60]
+
+
+if __name__ == "__main__":
+    main()
