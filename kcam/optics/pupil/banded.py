@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 _SLAB_NODES, _SLAB_PIXELS = 16, 32  # narrow enough to leave out most zeros, wide enough for a matrix product
+_WIDE = 512  # on a GPU, where a small product costs what a large one does
 
 
 def pieces(slabs: Sequence[Tensor], starts: Sequence[int], *, terms: int = 1) -> Iterator[tuple[Tensor, slice, slice]]:
@@ -18,6 +19,11 @@ def pieces(slabs: Sequence[Tensor], starts: Sequence[int], *, terms: int = 1) ->
         columns = slab.shape[1] // terms
         yield slab, slice(start, start + slab.shape[0]), slice(at, at + columns)
         at += columns
+
+
+def slab_width(narrow: int, device: torch.device) -> int:
+    """Columns of a slab."""
+    return narrow if device.type == "cpu" else _WIDE
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,8 @@ class MapWeights:
     @staticmethod
     def build(matrix: Tensor, *, dtype: torch.dtype, device: torch.device) -> MapWeights:
         """From the dense matrix (n, N)."""
+        nodes, pixels = (slab_width(narrow, device) for narrow in (_SLAB_NODES, _SLAB_PIXELS))
         return MapWeights(
-            forward=Banded.build(matrix, width=_SLAB_NODES, dtype=dtype, device=device),
-            adjoint=Banded.build(matrix.T, width=_SLAB_PIXELS, dtype=dtype, device=device),
+            forward=Banded.build(matrix, width=nodes, dtype=dtype, device=device),
+            adjoint=Banded.build(matrix.T, width=pixels, dtype=dtype, device=device),
         )

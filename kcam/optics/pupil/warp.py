@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kcam.optics.numerics import lagrange
-from kcam.optics.pupil.banded import pieces
+from kcam.optics.pupil.banded import pieces, slab_width
 from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.rim import kaiser_sinc
 
@@ -59,8 +59,9 @@ class Warp:
         coefficients, reach = _series(limit)
         terms = coefficients.shape[0]
         slabs, starts = [], []
-        for first in range(0, count, _SLAB):
-            columns = torch.arange(first, min(first + _SLAB, count))
+        width = slab_width(_SLAB, device)
+        for first in range(0, count, width):
+            columns = torch.arange(first, min(first + width, count))
             low, high = max(0, first - reach), min(count, int(columns[-1]) + reach + 1)
             lag = columns[None, :] - torch.arange(low, high)[:, None]
             inside_reach = lag.abs() <= reach
