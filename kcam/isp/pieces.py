@@ -91,6 +91,8 @@ class _Laid:
         self.sites = torch.arange(self.height * self.width, device=asked.device)
         row, column = self.sites // self.width, self.sites % self.width
         self.halves = [self.sites[(row + column) % 2 == part] for part in (0, 1)]
+        self.steps = torch.tensor([dy * book.width + dx for dy, dx in BESIDE], device=asked.device)
+        self.beside = {jump: self._beside(row, column, jump) for jump in set(JUMPS)}
         self.allowed = book.places
         widest = max(2, max(book.height, book.width) // 4)
         radii = [widest / 4**k for k in range(math.ceil(math.log(widest, 4)) + 1)]
@@ -112,11 +114,12 @@ class _Laid:
             found.append(places[misfit.argmin(1)])
         return torch.cat(found)
 
-    def _neighbour(self, sites: Tensor, dy: int, dx: int) -> tuple[Tensor, Tensor]:
-        """The pixels so far away, and whether they are in the picture."""
-        row, column = sites // self.width + dy, sites % self.width + dx
-        inside = (row >= 0) & (row < self.height) & (column >= 0) & (column < self.width)
-        return row.clamp(0, self.height - 1) * self.width + column.clamp(0, self.width - 1), inside
+    def _beside(self, row: Tensor, column: Tensor, jump: int) -> tuple[Tensor, Tensor]:
+        """The pixels so far away on four sides, (N,4), and whether they are in the picture."""
+        y, x = (jump * torch.tensor(side, device=row.device) for side in zip(*BESIDE, strict=True))
+        y, x = row[:, None] + y, column[:, None] + x
+        inside = (y >= 0) & (y < self.height) & (x >= 0) & (x < self.width)
+        return y.clamp(0, self.height - 1) * self.width + x.clamp(0, self.width - 1), inside
 
     def offer(self, sites: Tensor, places: Tensor) -> None:
         """Take the best of some places (N,K) at each of these pixels (N,), no two of them neighbours, if it helps."""
@@ -131,19 +134,18 @@ class _Laid:
             own = self.kept[sites, None]
             misfit = misfit + self.keep * ((places != own) & (own >= 0))
         gain = misfit - self.misfit[sites, None]
-        before, after = self.shown[sites, None], book.shown[places]
-        for dy, dx in BESIDE:
-            beside, inside = self._neighbour(sites, dy, dx)
-            step = dy * book.width + dx
-            theirs, there = book.shows(self.places[beside] - step)[:, None], self.shown[beside, None]
-            goes_on = self.places[beside, None] - step
-            seams = [
-                (mine - theirs).square().sum(2)
-                + (book.shows(place + step) - there).square().sum(2)
-                + self.joint * (place != goes_on)
-                for mine, place in ((after, places), (before, now))
-            ]
-            gain += self.seam * inside[:, None] * (seams[0] - seams[1])
+        beside, inside = (part[sites] for part in self.beside[1])
+        goes_on = (self.places[beside] - self.steps)[:, None]
+        theirs, there = book.shows(goes_on), self.shown[beside][:, None]
+
+        def seams(places: Tensor) -> Tensor:
+            """What they cost on all sides, (N,K)."""
+            cost = (book.shown[places][:, :, None] - theirs).square().sum(3)
+            cost += (book.shows(places[..., None] + self.steps) - there).square().sum(3)
+            cost += self.joint * (places[..., None] != goes_on)
+            return (cost * inside[:, None]).sum(2)
+
+        gain += self.seam * (seams(places) - seams(now))
         gain, best = gain.min(1)
         taken = gain < 0
         sites, best = sites[taken], best[taken, None]
@@ -153,11 +155,8 @@ class _Laid:
 
     def _at_seams(self, sites: Tensor) -> Tensor:
         """Whether two pieces meet at these pixels: inside of one, another place would have seams all around."""
-        meets = torch.zeros_like(sites, dtype=torch.bool)
-        for dy, dx in BESIDE:
-            beside, inside = self._neighbour(sites, dy, dx)
-            meets |= inside & (self.places[beside] - (dy * self.book.width + dx) != self.places[sites])
-        return meets
+        beside, inside = (part[sites] for part in self.beside[1])
+        return (inside & (self.places[beside] - self.steps != self.places[sites, None])).any(1)
 
     def round(self, generator: torch.Generator) -> None:
         """Offer to each pixel the pieces of its neighbours, places near its own, and some by chance."""
@@ -167,13 +166,11 @@ class _Laid:
             return torch.rand(*shape, generator=generator, device=generator.device).to(self.asked)
 
         def neighbours(jump: int, sites: Tensor) -> Tensor:
-            found = []
-            for dy, dx in BESIDE:
-                beside, _ = self._neighbour(sites, jump * dy, jump * dx)
-                turn, row, column = book.at(self.places[beside])
-                down, right = beside // self.width - sites // self.width, beside % self.width - sites % self.width
-                found.append(book.place(turn, row - down, column - right, self.places[sites]))
-            return torch.stack(found, dim=1)
+            beside = self.beside[jump][0][sites]
+            down = beside // self.width - sites[:, None] // self.width
+            right = beside % self.width - sites[:, None] % self.width
+            turn, row, column = book.at(self.places[beside])
+            return book.place(turn, row - down, column - right, self.places[sites, None])
 
         def near(sites: Tensor) -> Tensor:
             turn, row, column = (part[:, None] for part in book.at(self.places[sites]))
