@@ -31,7 +31,7 @@ from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, 
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.optics.rendering.zones import Axis
-from kcam.optics.source import Defocus, FieldPSFs, FieldSource, PixelGrid, Points, PSFSource
+from kcam.optics.source import Defocus, FieldPSFs, PixelGrid, Points, PSFSource, is_field_source, is_source
 from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.threads import no_more_than_free
@@ -105,7 +105,7 @@ class Imaging(Stage):
         **shortcuts: Unpack[Shortcuts],
     ) -> None:
         super().__init__()
-        if not isinstance(lens, PSFSource):
+        if not is_source(lens):
             raise TypeError(f"Imaging takes an optics.Lens or another source of PSFs, got {type(lens).__name__}.")
         if border not in BORDERS:
             raise ValueError(f"unknown border {border!r}; known: {', '.join(BORDERS)}.")
@@ -119,7 +119,7 @@ class Imaging(Stage):
         self.lens = lens
         self.pixel_pitch, self.fill_factor = check_pixel_pitch(pixel_pitch), fill_factor
         self.integrate, self.border, self.distance = integrate, border, distance
-        if field and not isinstance(lens, FieldSource):
+        if field and not is_field_source(lens):
             raise ValueError(f"a {type(lens).__name__} has one PSF, that on the axis: leave out field=True.")
         self.field, self.centre = field, None if centre is None else _checked_centre(centre)
         if not isinstance(accuracy, Accuracy):
@@ -575,7 +575,7 @@ class Imaging(Stage):
     @property
     def varies(self) -> bool:
         """Whether the PSF varies over the picture."""
-        if not isinstance(self.lens, FieldSource) or not self.accuracy.blur:
+        if not is_field_source(self.lens) or not self.accuracy.blur:
             return False
         return self.lens.varies if self.field is None else self.field
 

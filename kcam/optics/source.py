@@ -8,11 +8,12 @@ follows the protocol here.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -182,3 +183,34 @@ class FieldSource(PSFSource, Protocol):
 
     def over_field(self, reach: float, vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """For places up to `reach` from the axis [m], points at vergences (Z,) [1/m], wavelengths (L,) [m]."""
+
+
+def is_source(thing: Any) -> TypeGuard[PSFSource]:
+    """Whether `Imaging` can take its picture through a thing.
+
+    Example:
+    >>> from kcam.optics.source import is_source
+    >>> is_source(optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), focus_distance=2.0))
+    True
+    >>> is_source("a lens")
+    False
+    """
+    return _follows(thing, PSFSource)
+
+
+def is_field_source(thing: Any) -> TypeGuard[FieldSource]:
+    """Whether a thing's PSF may vary over the sensor.
+
+    Example:
+    >>> from kcam.optics.source import is_field_source
+    >>> is_field_source(optics.CompoundLens.preset("phone"))
+    True
+    """
+    return _follows(thing, FieldSource)
+
+
+def _follows(thing: Any, protocol: Any) -> bool:
+    """Whether it has all that is asked for; isinstance overlooks, from Python 3.12 on, what trains."""
+    asked = [part for part in protocol.__mro__ if getattr(part, "_is_protocol", False)]
+    names = {name for part in asked for name in (*vars(part), *inspect.get_annotations(part))}
+    return all(hasattr(thing, name) for name in names if not name.startswith("_"))
