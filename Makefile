@@ -54,14 +54,18 @@ docs-all: $(VENV)/docs.stamp
 	KCAM_DOCS_ALL=1 MPLBACKEND=Agg $(SPHINX)
 	$(BIN)/python docs/check_site.py
 
+# Then some on a device that is pretended: what a GPU would refuse is refused there too.
 test: $(VENV)/dev.stamp
 	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow" --device pretend tests/test_devices.py
 
 test-slow: $(VENV)/dev.stamp
 	$(PYTEST) -m slow
+	$(PYTEST) --device pretend
 
 test-all: $(VENV)/dev.stamp
 	$(PYTEST)
+	$(PYTEST) --device pretend
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.bench

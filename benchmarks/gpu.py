@@ -1,11 +1,11 @@
 """kcam on a GPU: pictures and plans, a training step, augmentations, styles; each time beside its error and the CPU's.
 
     python -m benchmarks.gpu                          about six minutes; writes benchmarks/results/gpu.json
-    python -m benchmarks.gpu --only styles,training   measures these anew, the others stay
+    python -m benchmarks.gpu --only styles,commands   measures these anew, the others stay
     python -m benchmarks.gpu --device cpu --quick --out FILE     toy sizes: checks that everything runs
 
 Times are wall seconds between two synchronisations, the median of some calls after a warm-up. The CPU's are of the
-machine that the GPU is in, with all the threads that kcam takes there; where they would take long, of one call. Errors
+machine that the GPU is in, with as many threads as torch has there; where they would take long, of one call. Errors
 are the raw picture's relative RMS without noise: of the GPU's reference from the CPU's, of plans from the reference
 where they run.
 """
@@ -21,7 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ TOLERANCES = (0.03, 0.01, 0.003)
 LONG = 2.0  # seconds of a call above which one must do
 ROUNDS = 5
 Row = dict[str, Any]
-PARTS = ("pictures", "augmentations", "styles", "training")
+PARTS = ("pictures", "augmentations", "styles", "commands")
 
 
 def seconds(call: Callable[[], Any], *, device: torch.device, most: float = LONG) -> float:
@@ -155,33 +156,47 @@ def augmentations(device: torch.device, quick: bool) -> list[Row]:
 
 
 def styles(device: torch.device, quick: bool) -> list[Row]:
-    """A shot with pieces, a painted picture, and whole commands."""
-    side = 64 if quick else 512
+    """A shot with pieces, 20 steps of painting, and of training."""
+    side, steps = (64, 2) if quick else (512, 20)
     photo = Scene.builtin("astronaut", side).to_srgb().to(device)
     picture = style.painting("strokes", size=side).to(device)
     rows: list[Row] = []
-    stage = isp.TextureTransfer(picture, seed=0).to(device)
+
+    def timed(what: str, call: Callable[[], Any]) -> None:
+        rows.append({"what": what, "gpu": seconds(call, device=device, most=0.1)})
+
+    pieces, laid = (isp.TextureTransfer(picture, seed=0, steps=count).to(device) for count in (20, 0))
     with torch.no_grad():
-        rows.append(
-            {"what": f"shot of {side} x {side} with pieces", "gpu": seconds(lambda: stage(photo), device=device)}
-        )
+        timed(f"shot of {side} x {side} with pieces", lambda: pieces(photo))
+        timed("the same as laid, steps=0", lambda: laid(photo))
     loss = style.StyleLoss(picture).to(device)
-    steps = 2 if quick else 200
-    rows.append(
-        {
-            "what": f"kcam paint, {steps} steps at {side} x {side}",
-            "gpu": seconds(lambda: style.paint(loss, photo=photo[0], steps=steps), device=device, most=0.1),
-        }
-    )
-    for preset in ("pieces", "quick"):
-        rows.append(
-            {"what": f"kcam train --preset {preset}"} | train(device, preset, *(["--steps", "2"] if quick else []))
-        )
+    timed(f"{steps} steps of style.paint, {side} x {side}", lambda: style.paint(loss, photo=photo[0], steps=steps))
+    preset = style.PRESETS["quick"]
+    camera, source = preset.camera().to(device), style.BuiltinScenes(preset.settings.size)
+    loss = preset.style_loss(style.painting("strokes").to(device)).to(device)
+    settings = replace(preset.settings, steps=steps, every=1000)
+    timed(f"{steps} steps of preset quick", lambda: style.fit(camera, loss, source=source, settings=settings))
     return rows
 
 
+# ---- whole commands ------------------------------------------------------------------------------------------------
+
+
+def commands(device: torch.device, quick: bool) -> list[Row]:
+    """kcam train from start to file; the thesis's size with VGG16 of random weights."""
+    with tempfile.TemporaryDirectory() as folder:
+        weights = Path(folder) / "vgg16.pth"
+        random_vgg16(weights)
+        vgg = ["--features", "vgg16", "--vgg-weights", str(weights)]
+        few = [] if not quick else ["--steps", "2"]
+        return [
+            train(device, "pieces", *few),
+            train(device, "quick", *few),
+            *(train(device, "thesis", *vgg, "--steps", str(count)) for count in ((1, 3) if quick else (20, 60))),
+        ]
+
+
 def train(device: torch.device, preset: str, *arguments: str) -> Row:
-    """The whole command from start to file."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "camera.safetensors"
         command = [sys.executable, "-m", "kcam", "train", "strokes", "--preset", preset, "--device", device.type]
@@ -189,34 +204,17 @@ def train(device: torch.device, preset: str, *arguments: str) -> Row:
         done = subprocess.run([*command, "--out", str(out), *arguments], capture_output=True, text=True, check=False)
         took = time.perf_counter() - start
         if done.returncode or not out.exists():
-            return {"error": (done.stdout + done.stderr)[-2000:]}
-    return {"gpu": took}
+            raise RuntimeError((done.stdout + done.stderr)[-2000:])
+    return {"what": " ".join(("kcam train --preset", preset, *arguments[-2:])), "gpu": took}
 
 
-# ---- training at the thesis's size ---------------------------------------------------------------------------------
-
-
-def training(device: torch.device, quick: bool) -> list[Row]:
-    """Steps of preset `thesis`: two crops of 256 x 256 and 28 bands, an 891 x 891 DOE, VGG16 of random weights."""
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        weights = Path(folder) / "vgg16.pth"
-        random_vgg16(weights)
-        for count in (1, 3) if quick else (20, 120):
-            how = ["--features", "vgg16", "--vgg-weights", str(weights), "--steps", str(count)]
-            rows.append({"what": f"kcam train --preset thesis, {count} steps"} | train(device, "thesis", *how))
-    if all("gpu" in row for row in rows):
-        rows.append({"what": "a step", "gpu": (rows[1]["gpu"] - rows[0]["gpu"]) / (2 if quick else 100)})
-    return rows
-
-
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default=",".join(PARTS))
     parser.add_argument("--out", type=Path, default=RESULTS)
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
     device, console = torch.device(given.device), Console(width=150)
     found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.exists() else {}
     found["environment"] = environment()

@@ -266,6 +266,7 @@ def peers_picture(path: Path) -> None:
 # ---- pictures over the field -----------------------------------------------------------------------------------------
 
 FIELD = RESULTS / "field.json"
+GPU = RESULTS / "gpu.json"
 FIELD_COLOURS = {"slr": "#3f6fd8", "phone_lens": "#c98a00"}
 
 
@@ -597,6 +598,36 @@ def waits_table() -> str:
         if "stages" in row:
             beside = ", ".join(f"{name} {value:.2f}" for name, value in row["stages"].items())
         lines.append(f"| {row['what']} | {seconds} | {beside} | {row['aim']} |")
+    return "\n".join(lines)
+
+
+def gpu_table() -> str:
+    """Pictures, augmentations and styles on a GPU, from benchmarks/results/gpu.json; what is no faster there is bold."""
+    content = json.loads(GPU.read_text())
+    lines = ["| camera, picture | plan | error | GPU ms | CPU ms | GPU ms with gradient |", "|---|---|---:|---:|---:|---:|"]
+    for row in content["pictures"]:
+        height, width = row["pixels"]
+        where = f"{row['camera']}, {height} x {width}" if row["plan"] == "reference" else ""
+        others = (figures(1e3 * row[name]) if name in row else "" for name in ("cpu", "gradient"))
+        lines.append(
+            f"| {where} | {row['plan']} | {row['error']:.1e} | {figures(1e3 * row['gpu'])} | {' | '.join(others)} |"
+        )
+    lines += ["", "| 64 pictures of 224 x 224 | GPU ms | CPU ms |", "|---|---:|---:|"]
+    for row in content["augmentations"]:
+        gpu = figures(1e3 * row["gpu"])
+        lines.append(
+            f"| `{row['augmentation']}` | {f'**{gpu}**' if row['gpu'] > 0.5 * row['cpu'] else gpu} "
+            f"| {figures(1e3 * row['cpu'])} |"
+        )
+    lines += ["", "| styles | GPU s |", "|---|---:|"]
+    lines += [f"| {row['what']} | {figures(row['gpu'])} |" for row in content["styles"]]
+    told = content["environment"]
+    lines += [
+        "",
+        f"<sub>{results_link(GPU)}: {told['gpu']}, the CPU is one thread of the {told['machine'].split(', ')[1]} beside "
+        f"it, torch {told['versions']['torch']}, {told['date'][:10]}; {told['clock']}, the median of some calls. Errors: "
+        "relative RMS of the raw picture, of the reference from the CPU's, of plans from the reference there.</sub>",
+    ]
     return "\n".join(lines)
 
 
@@ -936,6 +967,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "augmentation_speed": augmentation_speed_table,
     "augmentation_aims": augmentation_aims_table,
     "waits": waits_table,
+    "gpu": gpu_table,
     "segmentation": segmentation_table,
     "formats": formats_table,
     "glasses": glasses_table,

@@ -18,7 +18,7 @@ from rich.console import Console
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from benchmarks import against, augmentation, bench, peers, style_step
+from benchmarks import against, augmentation, bench, gpu, peers, style_step
 from benchmarks import field as over_field
 from benchmarks import patches as patch_stores
 from benchmarks.common import Contestant, race
@@ -442,3 +442,25 @@ def test_nothing_is_slower_than_in_the_version_before() -> None:
     rows = json.loads(against.RESULTS.read_text())["rows"]
     assert len(rows) >= 30
     assert [row["op"] for row in rows if row["ratio"] > 1 + against.ALLOWED + row["spread"]] == []
+
+
+@pytest.mark.parametrize(
+    "part", ["augmentations", *(pytest.param(part, marks=pytest.mark.slow) for part in ("pictures", "styles"))]
+)
+def test_the_gpus_parts_run_on_the_cpu(part: str, tmp_path: Path) -> None:
+    out = tmp_path / "gpu.json"
+    out.write_text(json.dumps({"other": [{"gpu": 1.0}]}))
+    gpu.main(["--device", "cpu", "--quick", "--only", part, "--out", str(out)])
+    content = json.loads(out.read_text())
+    assert content["other"] == [{"gpu": 1.0}]  # what was measured before stays
+    assert all(row["gpu"] > 0 for row in content[part])
+    if part == "pictures":
+        assert all(row["error"] <= float(row["plan"].split()[-1]) for row in content[part] if row["plan"] != "reference")
+
+
+def test_plans_kept_their_tolerance_on_a_gpu() -> None:
+    rows = json.loads(gpu.RESULTS.read_text())["pictures"]
+    planned = [row for row in rows if row["plan"] != "reference"]
+    assert len(planned) == 3 * (len(rows) - len(planned))
+    assert all(row["error"] <= float(row["plan"].split()[-1]) for row in planned)
+    assert all(row["error"] < 1e-6 for row in rows if row["plan"] == "reference")  # of the CPU's

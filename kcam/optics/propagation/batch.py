@@ -350,5 +350,6 @@ def _ring_shares(half: int, per_pixel: int, dtype: torch.dtype, device: torch.de
             values.append(share)
     index = torch.as_tensor(np.stack([np.concatenate(pixels), np.concatenate(columns)]))
     shape = ((half + 1) * (half + 2) // 2, rings)
-    found = torch.sparse_coo_tensor(index, torch.as_tensor(np.concatenate(values)), shape, check_invariants=False)
+    with torch.sparse.check_sparse_tensor_invariants(False):  # by this name also torch 2.11 on a GPU does not warn
+        found = torch.sparse_coo_tensor(index, torch.as_tensor(np.concatenate(values)), shape)
     return found.coalesce().to(device=device, dtype=dtype)
