@@ -602,9 +602,12 @@ def waits_table() -> str:
 
 
 def gpu_table() -> str:
-    """Pictures, augmentations and styles on a GPU, from benchmarks/results/gpu.json; what is no faster there is bold."""
+    """Pictures, augmentations and styles on a GPU, from benchmarks/results/gpu.json; what gains little is bold."""
     content = json.loads(GPU.read_text())
-    lines = ["| camera, picture | plan | error | GPU ms | CPU ms | GPU ms with gradient |", "|---|---|---:|---:|---:|---:|"]
+    lines = [
+        "| camera, picture | plan | error | GPU ms | CPU ms | GPU ms with gradient |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
     for row in content["pictures"]:
         height, width = row["pixels"]
         where = f"{row['camera']}, {height} x {width}" if row["plan"] == "reference" else ""
@@ -624,9 +627,10 @@ def gpu_table() -> str:
     told = content["environment"]
     lines += [
         "",
-        f"<sub>{results_link(GPU)}: {told['gpu']}, the CPU is one thread of the {told['machine'].split(', ')[1]} beside "
-        f"it, torch {told['versions']['torch']}, {told['date'][:10]}; {told['clock']}, the median of some calls. Errors: "
-        "relative RMS of the raw picture, of the reference from the CPU's, of plans from the reference there.</sub>",
+        f"<sub>{results_link(GPU)}: {told['gpu']}, the CPU is one thread of the {told['machine'].split(', ')[1]} "
+        f"beside it, torch {told['versions']['torch']}, {told['date'][:10]}; {told['clock']}, the median of some "
+        "calls. Errors: relative RMS of the raw picture, of the reference from the CPU's, of plans from the reference "
+        "there.</sub>",
     ]
     return "\n".join(lines)
 
