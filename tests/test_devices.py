@@ -6,9 +6,11 @@ python -m pytest --device cuda
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pretend
@@ -18,7 +20,7 @@ from stages import painting_stage
 from torch import Tensor, nn
 
 from benchmarks import planner as campaign
-from kcam import Camera, Scene, isp, optics, sensor, style
+from kcam import Camera, Scene, isp, optics, sensor, style, train
 from kcam.planner import noiseless_raw, relative_rms
 from kcam.units import um
 
@@ -120,3 +122,19 @@ def test_stages_of_pictures(name: str, device: torch.device) -> None:
     assert there.isfinite().all()
     off = (there.cpu() - here).square().mean().sqrt()
     assert off < (ROUNDING if device.type == pretend.NAME else ELSEWHERE.get(name, ROUNDING))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["pieces", "quick"])
+def test_a_whole_training(preset: str, device: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `kcam train --device` runs it: the sheet, the report, the card, and a camera that any machine loads."""
+    if device.type == pretend.NAME:
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        monkeypatch.setattr(train, "joined", lambda name: contextlib.nullcontext((True, device)))
+    out = tmp_path / "camera.safetensors"
+    done = train.run(train.Options(style="strokes", out=str(out), preset=preset, steps=3, size=64, device="cuda"))
+    assert len(done.history) == 3
+    assert {path.name for path in out.with_suffix("").iterdir()} >= {"sheet.png", "loss.png", "report.html"}
+    found = Camera.load(out)
+    assert all(part.device.type == "cpu" for part in (*found.parameters(), *found.buffers()))
+    assert found(Scene.builtin("coffee", 48).with_depth(2.0)).isfinite().all()
