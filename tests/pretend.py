@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.utils import backend_registration
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -72,6 +73,9 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         here["device"] = torch.device("cpu")
     result = _AT_ONCE.get(func, func)(*tree_map(_here, args), **here)
     written = [a for a, s in zip(args, func._schema.arguments, strict=False) if s.alias_info and s.alias_info.is_write]
+    if torch.Tag.inplace_view in func.tags:  # `squeeze_`: the wrapper's shape changes too
+        with no_dispatch():
+            func(*args, **kwargs)
     if written and isinstance(result, Tensor):
         return written[0]
     return tree_map(lambda leaf: Away(leaf) if to and isinstance(leaf, Tensor) else leaf, result)

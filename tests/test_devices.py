@@ -20,7 +20,7 @@ from stages import painting_stage
 from torch import Tensor, nn
 
 from benchmarks import planner as campaign
-from kcam import Camera, Scene, isp, optics, sensor, style, train
+from kcam import Camera, Scene, analysis, isp, optics, plots, sensor, style, train
 from kcam.planner import noiseless_raw, relative_rms
 from kcam.units import um
 
@@ -122,6 +122,29 @@ def test_stages_of_pictures(name: str, device: torch.device) -> None:
     assert there.isfinite().all()
     off = (there.cpu() - here).square().mean().sqrt()
     assert off < (ROUNDING if device.type == pretend.NAME else ELSEWHERE.get(name, ROUNDING))
+
+
+ASKED: dict[str, Callable[[Camera, Scene], Any]] = {
+    "explain": lambda camera, scene: camera.explain(scene, tolerance=0.02),
+    "raw": lambda camera, scene: camera.raw(scene),
+    "burst": lambda camera, scene: camera.burst(scene, exposures=[1.0, 2.0]),
+    "linear": lambda camera, scene: camera.linear(scene).adjoint(camera.linear(scene)(scene.coefficients)),
+    "compare": lambda camera, scene: plots.compare({"one": camera, "other": camera}, scene),
+    "pipeline": plots.pipeline,
+    "dynamic range": lambda camera, scene: analysis.dynamic_range(camera),
+    "signal to noise": lambda camera, scene: analysis.signal_to_noise(camera),
+    "colours": lambda camera, scene: analysis.colour_error(camera),
+    "noise power": lambda camera, scene: analysis.noise_power(camera),
+    "edge": lambda camera, scene: analysis.edge_response(camera),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", ASKED)
+def test_what_cameras_are_asked_there(asked: str, device: torch.device) -> None:
+    camera, scene = Camera.phone().to(device), Scene.builtin("motorcycle", 40).to(device)
+    found = ASKED[asked](camera, scene)
+    assert not isinstance(found, Tensor) or (found.device == device and found.isfinite().all())
 
 
 @pytest.mark.slow
