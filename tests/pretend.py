@@ -107,12 +107,14 @@ def register() -> None:
 @contextmanager
 def device() -> Iterator[torch.device]:
     """The device, usable inside of the context."""
-    real = torch.Generator
+    before = torch.Generator, torch.__future__.get_swap_module_params_on_conversion()
     torch.Generator = Generator  # type: ignore[misc]
+    torch.__future__.set_swap_module_params_on_conversion(True)  # a wrapper's `data` cannot be set
     torch._C._set_only_lift_cpu_tensors(True)
     try:
         with _Everywhere():
             yield torch.device(NAME, 0)
     finally:
         torch._C._set_only_lift_cpu_tensors(False)
-        torch.Generator = real  # type: ignore[misc]
+        torch.__future__.set_swap_module_params_on_conversion(before[1])
+        torch.Generator = before[0]  # type: ignore[misc]
