@@ -108,7 +108,8 @@ def run(
     Args:      threads: None for the cores that are free, or with `resume` as many as the run began with.
                advance: called after each step with the number of all steps.
                say: called with lines that a user should read.
-               folder_of_card: where to put the camera with its card, ready for a hub. licence: of the style.
+               folder_of_card: where to put the camera with its card, ready for a hub.
+               licence: of the style; with `resume` None for that which the run began with.
     Raises:    as `kcam.style.fit`; ValueError for options that do not fit together or another run's folder.
     """
     out = Path(options.out)
@@ -133,6 +134,9 @@ def run(
             say(line)
     with ExitStack() as stack:
         leads, device = stack.enter_context(joined(options.device))
+        licence = licence or _begun_licence(folder, resume)
+        if licence:
+            document["licence"] = licence
         document["threads"] = told_by_the_first(_threads(folder, resume, threads), place()[1])
         stack.enter_context(fixed(document["threads"]))
         if leads:  # the others would meet what this one has begun to write
@@ -311,10 +315,17 @@ class _Always(TypedDict):
 
 class _Config(_Always, total=False):
     photos: str
+    licence: str
 
 
 def _config(path: Path) -> _Config:
     return from_json(path.read_bytes(), _Config, wrong=f"{path} is damaged", fix="Start the run anew.", hook=None)
+
+
+def _begun_licence(folder: Path, resume: bool) -> str | None:
+    """What a run that goes on was told of its style."""
+    found = folder / "config.json"
+    return _config(found).get("licence") if resume and found.exists() else None
 
 
 def _threads(folder: Path, resume: bool, threads: int | None) -> int:

@@ -27,7 +27,7 @@ from kcam import Camera, cli, demo, files, memory, optics, plots, train
 from kcam.cli import console
 from kcam.optics.compound import presets
 from kcam.scene import read_picture
-from kcam.style import painting
+from kcam.style import STYLES, painting
 from kcam.units import mm, nm
 
 
@@ -346,6 +346,11 @@ def test_help_prints_what_was_written() -> None:
             assert "".join((sentence or "").split()) in printed, f"{name}: {sentence}"
             bracketed += "[" in (sentence or "")
     assert bracketed >= 5
+
+
+def test_help_names_the_styles() -> None:
+    for name in ("train", "paint"):
+        assert ", ".join(STYLES) in " ".join(unboxed(run(name, "--help")).split())
 
 
 def test_help_names_the_units() -> None:

@@ -32,10 +32,10 @@ def without_pictures(monkeypatch) -> None:
     monkeypatch.setattr(train, "_write_report", lambda *arguments: None)
 
 
-def run(out: Path, *, resume: bool = False, threads: int | None = 1, advance=None, **changes):
+def run(out: Path, *, resume: bool = False, threads: int | None = 1, advance=None, licence=None, **changes):
     lines: list[str] = []
     options = train.Options(**CHOSEN | {"out": str(out)} | changes)
-    return train.run(options, resume=resume, threads=threads, advance=advance, say=lines.append), lines
+    return train.run(options, resume=resume, threads=threads, advance=advance, say=lines.append, licence=licence), lines
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -83,7 +83,7 @@ def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) 
         if progress.step == 1:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    result, lines = run(out, stage=True, advance=stop_once)
+    result, lines = run(out, stage=True, advance=stop_once, licence="CC0-1.0")
     assert not result.finished
     assert lines == ["stopped after 1 of 3 steps; go on with --resume"]
     assert not out.exists()
@@ -91,6 +91,7 @@ def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) 
     result, _ = run(out, stage=True, resume=True, threads=None)
     assert result.finished
     assert out.read_bytes() == trained.read_bytes()
+    assert "licence: CC0-1.0" in out.with_suffix(".md").read_text()  # as the run was begun
 
 
 @pytest.mark.slow
