@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional as F
 
+from kcam.cache import ValueCache
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
 from kcam.isp.film import carried, in_whole_pixels, motions
@@ -126,20 +128,28 @@ def _with_tones_of(values: Tensor, others: Tensor) -> Tensor:
     return torch.lerp(theirs[index], theirs[index + 1], share)
 
 
+@dataclass(frozen=True)
 class _Exemplar:
-    """What pieces are taken from, in all turns and at all levels, and what they are compared by."""
+    """What pieces are taken from: a picture (3,h,w), its tones (2,h,w), in which units what is compared is, and its
+    places in all turns at all levels.
+    """
 
-    def __init__(self, picture: Tensor, *, turns: int, detail: float, flow: float, colour: float) -> None:
-        self.picture = picture
+    picture: Tensor
+    tones: Tensor
+    units: tuple[float, float, float, float]
+    books: tuple[Book, ...]
+
+    @classmethod
+    def of(cls, picture: Tensor, *, turns: int, detail: float, flow: float, colour: float) -> _Exemplar:
         luma = _luma(picture)
         tones, slopes = _tones(luma), _directions(luma)
-        self.tones = tones
-        self.scales = [
+        units = (
             math.sqrt(detail / max(float(tones[0].detach().var()), 1e-6)),
             1 / max(float(tones.detach().sum(0).std()), 1e-3),
             math.sqrt(flow),
             math.sqrt(colour),
-        ]
+        )
+        bare = cls(picture, tones, units, ())
         vectors = slopes[:2] / (slopes[2] + 1e-5)
         planes = torch.cat([tones, _colours(picture), vectors])
         parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in LEVELS]
@@ -149,22 +159,22 @@ class _Exemplar:
             found = turned(planes, angle)[0]
             cos, sin = math.cos(2 * angle), math.sin(2 * angle)
             along = torch.stack([cos * found[4] - sin * found[5], sin * found[4] + cos * found[5]])
-            found = torch.cat([seen.clamp(0, 1), self.scaled(torch.cat([found[:4], along]))])
+            found = torch.cat([seen.clamp(0, 1), bare.scaled(torch.cat([found[:4], along]))])
             for level, own in zip(LEVELS, parts, strict=True):
                 small = F.avg_pool2d(found[None], level)[0]
                 whole = F.avg_pool2d(inside[None, None].to(found), level)[0, 0] > 1 - 1e-4
                 whole = F.pad(whole[None, None].to(found), [1] * 4)  # a step beyond is beyond
                 allowed = -F.max_pool2d(-whole, 3, 1)[0, 0] > 0.5
                 own.append((small[:3].flatten(1).T, small[3:].flatten(1).T, allowed.flatten()))
-        self.books = []
+        books = []
         for level, own in zip(LEVELS, parts, strict=True):
             seen, compared, allowed = (torch.cat(part).contiguous() for part in zip(*own, strict=True))
-            size = (picture.shape[1] // level, picture.shape[2] // level)
-            self.books.append(Book(seen, compared, allowed, *size))
+            books.append(Book(seen, compared, allowed, picture.shape[1] // level, picture.shape[2] // level))
+        return replace(bare, books=tuple(books))
 
     def scaled(self, planes: Tensor) -> Tensor:
         """Tone, what is around it, two colours and two of a direction, in the unit in which they are compared."""
-        fine, wide, flow, colour = self.scales
+        fine, wide, flow, colour = self.units
         return torch.cat([fine * planes[:1], wide * planes[1:2], colour * planes[2:4], flow * planes[4:6]])
 
 
@@ -297,6 +307,7 @@ def texture_transfer(
     steps: int = 20,
     motion: Any = None,
     generator: torch.Generator | None = None,
+    kept: ValueCache | None = None,
 ) -> Tensor:
     """Paint pictures anew with pieces of an exemplar, which lie where tone, direction and colour ask for them.
 
@@ -322,6 +333,7 @@ def texture_transfer(
                to the next: (2,), (B-1,2), or (B-1,2,H,W) of each pixel of the later one. Strokes move with it. One that
                points out of the picture says that a pixel was not in view.
                generator: of what chance offers; None for torch's default one.
+               kept: keeps what is made of the exemplar for the next call: 0.8 s and 100 MB of 512 x 512 in eight turns.
     Returns:   same shape, in [0,1]. Differentiable in the exemplar, by the pieces that were taken, and in the picture
                and the glaze as far as that is laid over: which piece lies where has no slope, and the steps pass
                slopes on as they are. Transforms of torch.func need steps=0.
@@ -348,10 +360,13 @@ def texture_transfer(
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
     shown = _cropped(exemplar.to(picture))
-    source = _Exemplar(shown, turns=turns, detail=detail, flow=flow, colour=colour)
-    loss = None
-    if steps and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least:
-        loss = StyleLoss(shown.detach(), **FINISH)
+    finished = bool(steps) and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least
+
+    def build() -> tuple[_Exemplar, StyleLoss | None]:
+        source = _Exemplar.of(shown, turns=turns, detail=detail, flow=flow, colour=colour)
+        return source, StyleLoss(shown.detach(), **FINISH) if finished else None
+
+    source, loss = (kept or ValueCache()).get((shown, turns, detail, flow, colour, finished), build)
     how: Any = {"local": local, "seam": seam, "glaze": glaze, "palette": palette, "loss": loss, "steps": steps}
     moved = None if motion is None else in_whole_pixels(motions(motion, picture))
     painted: list[Tensor] = []
@@ -374,7 +389,8 @@ def _cropped(exemplar: Tensor) -> Tensor:
 class TextureTransfer(Stage):
     """Texture transfer behind ToneCurve: `texture_transfer`, which paints a picture with pieces of a painting.
 
-    It learns nothing by itself: what it needs is the painting. An exemplar that is an nn.Parameter trains.
+    It learns nothing by itself: what it needs is the painting. An exemplar that is an nn.Parameter trains. What was
+    made of it is kept for the next picture.
 
     Args:      exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way; it is saved with the camera.
                detail, seam, flow, colour: weights, >= 0.  local, palette: 0..1.  glaze: >= 0.  turns: 1 or more.
@@ -417,6 +433,7 @@ class TextureTransfer(Stage):
         hold(self, exemplar=exemplar, glaze=glaze)
         self.detail, self.seam, self.flow, self.colour = detail, seam, flow, colour
         self.local, self.palette, self.turns, self.steps, self.seed = local, palette, turns, steps, seed
+        self._kept = ValueCache()
 
     def mean(self) -> TextureTransfer:
         """One picture of those that it paints, always the same, not their mean. Shares the exemplar."""
@@ -458,6 +475,7 @@ class TextureTransfer(Stage):
             steps=self.steps,
             motion=motion,
             generator=told if self.seed is None else torch.Generator("cpu").manual_seed(self.seed),
+            kept=self._kept,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import math
 from typing import Any
@@ -126,7 +127,7 @@ def test_pieces_cost_nothing_inside_and_offers_lower_the_sum() -> None:
 
 
 def exemplar_of(picture: Tensor, turns: int = 8):
-    return transfer._Exemplar(picture, turns=turns, detail=3.0, flow=0.5, colour=0.1)
+    return transfer._Exemplar.of(picture, turns=turns, detail=3.0, flow=0.5, colour=0.1)
 
 
 def test_the_palette_is_that_of_the_exemplar_and_what_is_brighter_stays_so() -> None:
@@ -317,3 +318,28 @@ def test_nan_is_refused() -> None:
 def test_it_repaints_pictures_only() -> None:
     with pytest.raises(ValueError, match=r"TextureTransfer repaints pictures \(B,3,H,W\)"):
         isp.TextureTransfer(torch.rand(3, 64, 64))(torch.rand(1, 1, 8, 8))
+
+
+def test_what_was_made_of_an_exemplar_is_kept_until_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    real = transfer._Exemplar.of.__func__
+    monkeypatch.setattr(
+        transfer._Exemplar, "of", classmethod(lambda cls, *args, **how: made.append(0) or real(cls, *args, **how))
+    )
+    shown = torch.rand(1, 3, 64, 64, generator=seeded())
+    stage = isp.TextureTransfer(painting("strokes", size=64), seed=0, turns=1, steps=1)
+    with torch.no_grad():
+        first, second = stage(shown), stage(shown)
+        assert len(made) == 1
+        assert torch.equal(first, second)
+        stage.exemplar.mul_(0.5)  # in place, as load_state_dict does
+        changed = stage(shown)
+        assert len(made) == 2
+        fresh = isp.TextureTransfer(stage.exemplar.clone(), seed=0, turns=1, steps=1)(shown)
+        assert torch.equal(changed, fresh)
+        stage.detail = 1.0
+        assert not torch.equal(stage(shown), changed)
+        assert torch.equal(copy.deepcopy(stage)(shown), stage(shown))
+    trained = isp.TextureTransfer(nn.Parameter(painting("strokes", size=64)), seed=0, turns=1, steps=1)
+    for _ in range(2):  # a graph is never kept
+        trained(shown).sum().backward()
