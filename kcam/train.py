@@ -283,14 +283,10 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _check_folder(folder: Path, document: dict[str, Any], *, resume: bool) -> None:
-    """A folder holds one run: it goes on with the options that it began with, under whatever name.
-
-    One that failed before its first checkpoint has not begun.
-    """
-    found = folder / "config.json"
-    if not found.exists() or not any((folder / "checkpoints").glob("step-*")):
+    """A folder holds one run: it goes on with the options that it began with, under whatever name."""
+    if not _has_begun(folder):
         return
-    there = _config(found)
+    there = _config(folder / "config.json")
     if not resume:
         raise ValueError(f"{folder} holds a run. Go on with --resume, choose another --out, or remove the folder.")
     for name, value in document["options"].items():
@@ -322,10 +318,14 @@ def _config(path: Path) -> _Config:
     return from_json(path.read_bytes(), _Config, wrong=f"{path} is damaged", fix="Start the run anew.", hook=None)
 
 
+def _has_begun(folder: Path) -> bool:
+    """Whether there is a run with a checkpoint: one that failed before its first has not begun."""
+    return (folder / "config.json").exists() and any((folder / "checkpoints").glob("step-*"))
+
+
 def _begun_licence(folder: Path, resume: bool) -> str | None:
     """What a run that goes on was told of its style."""
-    found = folder / "config.json"
-    return _config(found).get("licence") if resume and found.exists() else None
+    return _config(folder / "config.json").get("licence") if resume and _has_begun(folder) else None
 
 
 def _threads(folder: Path, resume: bool, threads: int | None) -> int:

@@ -13,14 +13,18 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils import backend_registration
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 NAME = "pretend"
-MIXES = ("aten::copy", "aten::_to_copy", "aten::index", "aten::_index", "aten::_unsafe_index")
-"""Operations that CUDA allows tensors of two devices in: copies, and indices on the CPU."""
+COPIES = ("aten::copy", "aten::copy_", "aten::_to_copy")
+INDEXED = ("aten::index", "aten::_unsafe_index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
+"""Operations that CUDA lets a device's tensor have indices of the CPU in."""
+JOINED = ("aten::cat", "aten::stack")
+"""Others take a number of the CPU's, of no dimension, beside a device's tensors."""
 
 _AT_ONCE = {
     torch.ops.aten._conj.default: torch.ops.aten.conj_physical.default,
@@ -59,15 +63,22 @@ class _Everywhere(TorchDispatchMode):
         return _run(func, args, kwargs or {})
 
 
+class _Draws(TorchFunctionMode):
+    """Refuses a generator of another device: behind this, torch forgets whose object one is."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        device = torch.device(kwargs.get("device") or (NAME if _any_away((args, kwargs)) else "cpu")).type
+        for leaf in tree_leaves((args, kwargs)):
+            if isinstance(leaf, torch._C.Generator) and leaf.device.type != device:
+                raise RuntimeError(f"a generator on {leaf.device} for what is on {device}")
+        return func(*args, **kwargs)
+
+
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    name = func._schema.name
-    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-    away = [tensor for tensor in tensors if isinstance(tensor, Away)]
-    left = [tuple(t.shape) for t in tensors if t.dim() and not isinstance(t, Away)]
-    if away and left and not name.startswith(MIXES):
-        raise RuntimeError(f"{name}: tensors on two devices; on the CPU: {left}")
+    _refuse_mixes(func._schema.name, args, kwargs)
     device = kwargs.get("device")
-    to = bool(away) if device is None else torch.device(device).type == NAME
+    to = _any_away((args, kwargs)) if device is None else torch.device(device).type == NAME
     here = {key: tree_map(_here, value) for key, value in kwargs.items()}
     if device is not None:
         here["device"] = torch.device("cpu")
@@ -79,6 +90,23 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if written and isinstance(result, Tensor):
         return written[0]
     return tree_map(lambda leaf: Away(leaf) if to and isinstance(leaf, Tensor) else leaf, result)
+
+
+def _refuse_mixes(name: str, args: Any, kwargs: dict[str, Any]) -> None:
+    """RuntimeError for tensors of two devices, where CUDA raises one."""
+    counted = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+    if name in INDEXED:
+        counted = [args[0], *args[2:3]]
+    away = [tensor for tensor in counted if isinstance(tensor, Away)]
+    left = [t for t in counted if not isinstance(t, Away) and (t.dim() or name in JOINED)]
+    if name not in COPIES and away and left:
+        raise RuntimeError(f"{name}: tensors on two devices; on the CPU: {[tuple(tensor.shape) for tensor in left]}")
+    if name in INDEXED and not isinstance(args[0], Away) and _any_away(args[1:]):
+        raise RuntimeError(f"{name}: a tensor on the CPU is indexed by one on {NAME}")
+
+
+def _any_away(tree: Any) -> bool:
+    return any(isinstance(leaf, Away) for leaf in tree_leaves(tree))
 
 
 def _here(leaf: Any) -> Any:
@@ -93,10 +121,17 @@ class _Module(backend_registration._DummyBackendModule):
 
 
 class Generator(torch.Generator):
-    """The CPU's, whatever the device."""
+    """One of the CPU's, which knows the device that it was made for."""
 
     def __new__(cls, device: Any = "cpu") -> Generator:
         return super().__new__(cls, "cpu")
+
+    def __init__(self, device: Any = "cpu") -> None:
+        self._asked = torch.device(device)
+
+    @property
+    def device(self) -> torch.device:  # type: ignore[override]
+        return self._asked
 
 
 def register() -> None:
@@ -112,7 +147,7 @@ def device() -> Iterator[torch.device]:
     torch.__future__.set_swap_module_params_on_conversion(True)  # a wrapper's `data` cannot be set
     torch._C._set_only_lift_cpu_tensors(True)
     try:
-        with _Everywhere():
+        with _Everywhere(), _Draws():
             yield torch.device(NAME, 0)
     finally:
         torch._C._set_only_lift_cpu_tensors(False)

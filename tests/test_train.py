@@ -94,6 +94,14 @@ def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) 
     assert "licence: CC0-1.0" in out.with_suffix(".md").read_text()  # as the run was begun
 
 
+def test_the_licence_of_a_run_that_never_began_is_not_the_next_ones(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"options": {}, "style": "", "threads": 1, "licence": "MIT"}')
+    assert train._begun_licence(tmp_path, resume=True) is None
+    (tmp_path / "checkpoints" / "step-000001").mkdir(parents=True)
+    assert train._begun_licence(tmp_path, resume=True) == "MIT"
+    assert train._begun_licence(tmp_path, resume=False) is None
+
+
 @pytest.mark.slow
 def test_a_run_goes_on_with_its_own_options(tmp_path: Path, monkeypatch) -> None:
     without_pictures(monkeypatch)

@@ -12,7 +12,7 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional as F
 
-from kcam.cache import ValueCache
+from kcam.cache import ValueCache, recorded
 from kcam.context import Context, Stage
 from kcam.inputs import check_picture, check_signal, remedy
 from kcam.isp.film import carried, in_whole_pixels, motions
@@ -360,6 +360,8 @@ def texture_transfer(
     if generator is None:
         generator = torch.Generator("cpu").manual_seed(int(torch.randint(2**62, (), dtype=torch.long)))
     shown = _cropped(exemplar.to(picture))
+    if not recorded(shown):  # what trains elsewhere, shown without a graph
+        shown = shown.detach()
     finished = bool(steps) and min(*picture.shape[-2:], *shown.shape[-2:]) >= SteerableFeatures.least
 
     def build() -> tuple[_Exemplar, StyleLoss | None]:

@@ -341,5 +341,11 @@ def test_what_was_made_of_an_exemplar_is_kept_until_it_changes(monkeypatch: pyte
         assert not torch.equal(stage(shown), changed)
         assert torch.equal(copy.deepcopy(stage)(shown), stage(shown))
     trained = isp.TextureTransfer(nn.Parameter(painting("strokes", size=64)), seed=0, turns=1, steps=1)
-    for _ in range(2):  # a graph is never kept
-        trained(shown).sum().backward()
+    made.clear()
+    slopes = [torch.autograd.grad(trained(shown).sum(), trained.exemplar)[0] for _ in range(2)]
+    assert len(made) == 2  # a graph is never kept
+    assert torch.equal(*slopes)
+    with torch.no_grad():
+        for _ in range(2):
+            trained(shown)
+    assert len(made) == 3

@@ -63,6 +63,8 @@ class CompoundLens(nn.Module):
         focus_wavelength: [m].
     Raises: ValueError for not exactly one stop, both or neither distance, a focus that does not exist, glass in front
         of the sensor; TypeError for what is no Surface.
+    Rays are traced on the CPU, wherever the lens is, as they are few; what it is asked for itself is answered there,
+    and the PSFs of a picture are made where that is.
     Valid for scalar light; surfaces are refracting, without coatings, and share one axis. PSFs are good to 1e-3 of
     their light down to f/4, and 3e-3 at f/1.85, against a sum over rays (tests/optics/test_compound.py).
     Object points are (X / D, Y / D) with D from the paraxial entrance pupil; light falls as in `units`: a point at
@@ -629,7 +631,7 @@ class CompoundLens(nn.Module):
             from the axis, so that their frequency is across it, and of tangential ones; on the axis, in x and in y.
         Raises: ValueError for frequencies that are negative or not finite; as `psf`.
         """
-        lines = as_values(frequencies, name="frequencies", unit="cycles per metre").to(torch.float64).reshape(-1)
+        lines = as_values(frequencies, name="frequencies", unit="cycles per metre").to("cpu", torch.float64).reshape(-1)
         if not bool((lines.isfinite() & (lines >= 0)).all()):
             raise ValueError(
                 f"frequencies must be finite and >= 0 cycles per metre, got {lines.tolist()}. 30 line pairs per mm are "
@@ -702,7 +704,7 @@ class CompoundLens(nn.Module):
         asked = self._asked(self._colours(wavelengths), distance, field)
         counts = torch.ones(len(asked.heights), len(asked.wavelengths), dtype=torch.float64)
         if weights is not None:
-            given = as_values(weights, name="weights", unit="of each field and wavelength").to(torch.float64)
+            given = as_values(weights, name="weights", unit="of each field and wavelength").to("cpu", torch.float64)
             if given.shape != counts.shape or not bool((given >= 0).all() and (given.sum(1) > 0).any()):
                 raise ValueError(
                     f"weights must be {tuple(counts.shape)} for fields and wavelengths, >= 0 and not all 0, got shape "
@@ -775,7 +777,7 @@ class CompoundLens(nn.Module):
             rms_spot=analysis.rms_radius(points.flatten(1, 3), weights.flatten(1, 3)),
             mtf=self.modulation(frequencies, wavelengths=grid, distance=distance, field=field),
             wavelengths=grid,
-            frequencies=torch.as_tensor(frequencies, dtype=torch.float64),
+            frequencies=torch.as_tensor(frequencies, dtype=torch.float64, device="cpu"),
         )
 
     def paths(
