@@ -4,10 +4,10 @@
     python -m benchmarks.gpu --only styles,commands   measures these anew, the others stay
     python -m benchmarks.gpu --device cpu --quick --out FILE     toy sizes: checks that everything runs
 
-Times are wall seconds between two synchronisations, the median of some calls after a warm-up. The CPU's are of the
-machine that the GPU is in, with as many threads as torch has there; where they would take long, of one call. Errors
-are the raw picture's relative RMS without noise: of the GPU's reference from the CPU's, of plans from the reference
-where they run.
+Times are wall seconds between two synchronisations, the median of five calls after a warm-up; where that would take
+long, of one call, which is told. The CPU's are of the machine that the GPU is in, with as many threads as torch has
+there. Errors are the raw picture's relative RMS without noise: of the GPU's reference from the CPU's, of plans from the
+reference where they run.
 """
 
 from __future__ import annotations
@@ -44,12 +44,11 @@ TOLERANCES = (0.03, 0.01, 0.003)
 LONG = 2.0  # seconds of a call above which one must do
 ROUNDS = 5
 Row = dict[str, Any]
-PARTS = ("pictures", "augmentations", "styles", "commands")
 
 
-def seconds(call: Callable[[], Any], *, device: torch.device, most: float = LONG) -> float:
-    """Wall seconds of a call, the median of `ROUNDS` after one that warms up; of one or none after it where each takes
-    long.
+def timed(where: str, call: Callable[[], Any], *, device: torch.device, most: float = LONG) -> Row:
+    """Wall seconds of a call, the median of `ROUNDS` after one that warms up; where each takes long of one after it, or
+    of the first.
     """
 
     def once() -> float:
@@ -61,11 +60,12 @@ def seconds(call: Callable[[], Any], *, device: torch.device, most: float = LONG
             torch.cuda.synchronize()
         return time.perf_counter() - start
 
-    first = once()
-    if first > 5 * most:
-        return first
-    second = once()
-    return second if second > most else statistics.median([second, *(once() for _ in range(ROUNDS - 1))])
+    times = [once()]
+    if times[0] < 5 * most:
+        times = [once()]
+        if times[0] < most:
+            times += [once() for _ in range(ROUNDS - 1)]
+    return {where: statistics.median(times), f"{where}_calls": len(times)}
 
 
 # ---- pictures ------------------------------------------------------------------------------------------------------
@@ -114,22 +114,22 @@ def pictures_of(name: str, camera: Camera, scene: Scene, device: torch.device) -
     here: list[Tensor] = []
     with torch.no_grad():
         own = copy.deepcopy(camera)
-        cpu = seconds(lambda: here.append(shot(own, scene)), device=torch.device("cpu"), most=0.5)
+        cpu = timed("cpu", lambda: here.append(shot(own, scene)), device=torch.device("cpu"), most=0.5)
         camera, scene = camera.to(device), scene.to(device)
         reference = shot(camera, scene)
-        gpu = seconds(lambda: shot(camera, scene), device=device)
-        rows = [row("reference", relative_rms(reference.cpu(), here[0]), gpu=gpu, cpu=cpu)]
+        gpu = timed("gpu", lambda: shot(camera, scene), device=device)
+        rows = [row("reference", relative_rms(reference.cpu(), here[0]), **gpu, **cpu)]
         for tolerance in TOLERANCES:
             start = time.perf_counter()
             plan = camera.plan(scene, tolerance=tolerance)
             planning = time.perf_counter() - start
             planned = plan.apply(camera)
             error = relative_rms(shot(planned, scene), reference)
-            gpu = seconds(functools.partial(shot, planned, scene), device=device)
-            rows.append(row(f"tolerance {tolerance:g}", error, gpu=gpu, planning=planning, changes=str(plan.changes)))
+            gpu = timed("gpu", functools.partial(shot, planned, scene), device=device)
+            rows.append(row(f"tolerance {tolerance:g}", error, **gpu, planning=planning, changes=str(plan.changes)))
     light = scene.coefficients if scene.spectra is None else scene.spectra
     light.requires_grad_()
-    rows[0]["gradient"] = seconds(lambda: shot(camera, scene).square().mean().backward(), device=device)
+    rows[0] |= timed("gradient", lambda: shot(camera, scene).square().mean().backward(), device=device)
     return rows
 
 
@@ -146,9 +146,9 @@ def augmentations(device: torch.device, quick: bool) -> list[Row]:
             continue
         augmentation = getattr(KC, name)(p=1.0)
         with torch.no_grad():
-            gpu = seconds(lambda: augmentation(there), device=device)  # noqa: B023
-            cpu = seconds(lambda: augmentation(batch), device=torch.device("cpu"), most=0.3)  # noqa: B023
-        rows.append({"augmentation": name, "shape": list(shape), "gpu": gpu, "cpu": cpu})
+            gpu = timed("gpu", functools.partial(augmentation, there), device=device)
+            cpu = timed("cpu", functools.partial(augmentation, batch), device=torch.device("cpu"), most=0.3)
+        rows.append({"augmentation": name, "shape": list(shape)} | gpu | cpu)
     return rows
 
 
@@ -162,20 +162,20 @@ def styles(device: torch.device, quick: bool) -> list[Row]:
     picture = style.painting("strokes", size=side).to(device)
     rows: list[Row] = []
 
-    def timed(what: str, call: Callable[[], Any]) -> None:
-        rows.append({"what": what, "gpu": seconds(call, device=device, most=0.1)})
+    def row(what: str, call: Callable[[], Any]) -> None:
+        rows.append({"what": what} | timed("gpu", call, device=device, most=0.1))
 
     pieces, laid = (isp.TextureTransfer(picture, seed=0, steps=count).to(device) for count in (20, 0))
     with torch.no_grad():
-        timed(f"shot of {side} x {side} with pieces", lambda: pieces(photo))
-        timed("the same as laid, steps=0", lambda: laid(photo))
+        row(f"shot of {side} x {side} with pieces", lambda: pieces(photo))
+        row("the same as laid, steps=0", lambda: laid(photo))
     loss = style.StyleLoss(picture).to(device)
-    timed(f"{steps} steps of style.paint, {side} x {side}", lambda: style.paint(loss, photo=photo[0], steps=steps))
+    row(f"{steps} steps of style.paint, {side} x {side}", lambda: style.paint(loss, photo=photo[0], steps=steps))
     preset = style.PRESETS["quick"]
     camera, source = preset.camera().to(device), style.BuiltinScenes(preset.settings.size)
     loss = preset.style_loss(style.painting("strokes").to(device)).to(device)
     settings = replace(preset.settings, steps=steps, every=1000)
-    timed(f"{steps} steps of preset quick", lambda: style.fit(camera, loss, source=source, settings=settings))
+    row(f"{steps} steps of preset quick", lambda: style.fit(camera, loss, source=source, settings=settings))
     return rows
 
 
@@ -208,33 +208,45 @@ def train(device: torch.device, preset: str, *arguments: str) -> Row:
     return {"what": " ".join(("kcam train --preset", preset, *arguments[-2:])), "gpu": took}
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--only", default=",".join(PARTS))
+    parser.add_argument("--only", default=",".join(MEASURED))
     parser.add_argument("--out", type=Path, default=RESULTS)
     given = parser.parse_args(arguments)
     device, console = torch.device(given.device), Console(width=150)
-    found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.exists() else {}
-    found["environment"] = environment()
+    content: dict[str, Any] = json.loads(given.out.read_text()) if given.out.exists() else {}
+    told = environment() | {"clock": "wall seconds between two synchronisations"}
     if device.type == "cuda":
-        found["environment"]["gpu"] = torch.cuda.get_device_name()
+        told["gpu"] = torch.cuda.get_device_name()
+    failed = 0
     for part in given.only.split(","):
         start = time.perf_counter()
         try:
-            found[part] = globals()[part](device, given.quick)
-        except Exception as error:  # what was measured before is worth keeping
+            rows = MEASURED[part](device, given.quick)
+        except Exception:  # the other parts are worth their time, and what was measured before stays
             console.print_exception()
-            found[part] = [{"error": repr(error)}]
-        write_json(given.out, found)  # a lease may end at any moment
+            failed = 1
+            continue
+        content[part] = {"environment": told, "rows": rows}
+        write_json(given.out, content)  # a lease may end at any moment
         table = Table(title=f"{part}, {time.perf_counter() - start:.0f} s", box=None, title_justify="left")
-        names = list(dict.fromkeys(name for row in found[part] for name in row))
+        names = list(dict.fromkeys(name for row in rows for name in row))
         for name in names:
             table.add_column(name)
-        for row in found[part]:
+        for row in rows:
             table.add_row(*(_text(row.get(name)) for name in names))
         console.print(table, "")
+    return failed
+
+
+MEASURED: dict[str, Callable[[torch.device, bool], list[Row]]] = {
+    "pictures": pictures,
+    "augmentations": augmentations,
+    "styles": styles,
+    "commands": commands,
+}
 
 
 def _text(value: Any) -> str:
@@ -242,4 +254,4 @@ def _text(value: Any) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -450,12 +450,26 @@ def test_nothing_is_slower_than_in_the_version_before() -> None:
 def test_the_gpus_parts_run_on_the_cpu(part: str, tmp_path: Path) -> None:
     out = tmp_path / "gpu.json"
     out.write_text(json.dumps({"other": [{"gpu": 1.0}]}))
-    gpu.main(["--device", "cpu", "--quick", "--only", part, "--out", str(out)])
+    assert gpu.main(["--device", "cpu", "--quick", "--only", part, "--out", str(out)]) == 0
     content = json.loads(out.read_text())
     assert content["other"] == [{"gpu": 1.0}]  # what was measured before stays
-    assert all(row["gpu"] > 0 for row in content[part])
+    rows = content[part]["rows"]
+    assert all(row["gpu"] > 0 and row["gpu_calls"] in (1, gpu.ROUNDS) for row in rows)
     if part == "pictures":
-        assert within_tolerance(content[part])
+        assert within_tolerance(rows)
+
+
+def test_a_part_that_fails_leaves_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(device: torch.device, quick: bool) -> list[dict]:
+        raise RuntimeError("no GPU any more")
+
+    monkeypatch.setitem(gpu.MEASURED, "styles", fails)
+    out = tmp_path / "gpu.json"
+    out.write_text(json.dumps({"styles": [{"gpu": 1.0}]}))
+    assert gpu.main(["--device", "cpu", "--quick", "--only", "styles,augmentations", "--out", str(out)]) == 1
+    content = json.loads(out.read_text())
+    assert content["styles"] == [{"gpu": 1.0}]
+    assert content["augmentations"]["rows"]
 
 
 def within_tolerance(rows: list[dict]) -> bool:
@@ -464,6 +478,6 @@ def within_tolerance(rows: list[dict]) -> bool:
 
 
 def test_plans_kept_their_tolerance_on_a_gpu() -> None:
-    rows = json.loads(gpu.RESULTS.read_text())["pictures"]
+    rows = json.loads(gpu.RESULTS.read_text())["pictures"]["rows"]
     assert within_tolerance(rows)
     assert all(row["error"] < 1e-6 for row in rows if row["plan"] == "reference")  # of the CPU's

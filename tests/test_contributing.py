@@ -76,7 +76,7 @@ def test_a_stage(done: dict[str, Any]) -> None:
 def test_a_source_of_psfs(done: dict[str, Any]) -> None:
     scene = done["scene"]
     source = done["Pillbox"](0.003, 0.0513, 2.0)
-    assert isinstance(source, optics.source.PSFSource)
+    assert optics.source.is_source(source)
     camera = Camera(
         optics.Imaging(source), sensor.ColourFilter.kodak(), sensor.Mosaic("RGGB"), sensor.Exposure(time=0.01)
     )

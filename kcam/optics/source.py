@@ -8,12 +8,13 @@ follows the protocol here.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, Protocol, TypeGuard, runtime_checkable
+from typing import Any, Protocol, TypeGuard
 
 import torch
 from torch import Tensor
@@ -96,7 +97,6 @@ class Defocus:
         return self.floor + self.spread * torch.maximum((vergence - low).abs(), (vergence - high).abs())
 
 
-@runtime_checkable
 class PSFSource(Photometric, Protocol):
     """Optics, as `Imaging` asks them; an nn.Module where it trains. To be saved, it keeps its arguments.
 
@@ -172,7 +172,6 @@ class FieldPSFs(Protocol):
         """
 
 
-@runtime_checkable
 class FieldSource(PSFSource, Protocol):
     """Optics whose PSF varies over the sensor, computed for any place.
 
@@ -211,6 +210,11 @@ def is_field_source(thing: Any) -> TypeGuard[FieldSource]:
 
 def _follows(thing: Any, protocol: Any) -> bool:
     """Whether it has all that is asked for; isinstance overlooks, from Python 3.12 on, what trains."""
-    asked = [part for part in protocol.__mro__ if getattr(part, "_is_protocol", False)]
-    names = {name for part in asked for name in (*vars(part), *inspect.get_annotations(part))}
-    return all(hasattr(thing, name) for name in names if not name.startswith("_"))
+    return all(hasattr(type(thing), name) or hasattr(thing, name) for name in _asked_by(protocol))
+
+
+@functools.cache
+def _asked_by(protocol: Any) -> tuple[str, ...]:
+    parts = [part for part in protocol.__mro__ if getattr(part, "_is_protocol", False)]
+    names = {name for part in parts for name in (*vars(part), *inspect.get_annotations(part))}
+    return tuple(sorted(name for name in names if not name.startswith("_")))

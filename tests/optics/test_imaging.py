@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from kcam import Camera, optics, sensor
 from kcam.context import Context
+from kcam.optics import source
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.propagation.table import PROPAGATORS, choose
@@ -1057,3 +1058,13 @@ def test_an_even_scene_is_as_bright_whatever_the_fill_factor(fill_factor: float)
         optics.Imaging(sharp, pixel_pitch=3 * um, fill_factor=f, psf_shape=(25, 25))(white) for f in (1.0, fill_factor)
     )
     torch.testing.assert_close(part, whole, rtol=1e-9, atol=1e-9)
+
+
+def test_a_lens_whose_sensor_distance_trains_is_a_source() -> None:
+    """isinstance with a protocol does not see it from Python 3.12 on."""
+    distance = nn.Parameter(torch.tensor(0.0513, dtype=torch.float64))
+    lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), sensor_distance=distance)
+    assert source.is_source(lens)
+    assert source.is_field_source(lens)
+    assert not source.is_source(nn.Identity())
+    optics.Imaging(lens)
