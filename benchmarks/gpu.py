@@ -34,9 +34,7 @@ from torch import Tensor
 import kcam.augmentation as KC
 from benchmarks.common import ROOT, environment, write_json
 from benchmarks.style_step import random_vgg16
-from kcam import Camera, Scene, isp, optics, sensor, style
-from kcam.planner import noiseless_raw, relative_rms
-from kcam.planner.planner import fresh
+from kcam import Camera, Scene, isp, optics, planner, sensor, style
 from kcam.units import mm, um
 
 RESULTS = ROOT / "benchmarks" / "results" / "gpu.json"
@@ -46,7 +44,7 @@ ROUNDS = 5
 Row = dict[str, Any]
 
 
-def timed(where: str, call: Callable[[], Any], *, device: torch.device, most: float = LONG) -> Row:
+def wall(where: str, call: Callable[[], Any], *, device: torch.device, most: float = LONG) -> Row:
     """Wall seconds of a call, the median of `ROUNDS` after one that warms up; where each takes long of one after it, or
     of the first.
     """
@@ -106,7 +104,7 @@ def pictures_of(name: str, camera: Camera, scene: Scene, device: torch.device) -
 
     def shot(chosen: Camera, light: Scene) -> Tensor:
         """With new optics, of which nothing is kept."""
-        return noiseless_raw(Camera(*(fresh(stage) for stage in chosen), context=chosen.context))(light)
+        return planner.timed(chosen, light)[1]
 
     def row(plan: str, error: float, **others: Any) -> Row:
         return {"camera": name, "pixels": list(scene.shape[-2:]), "plan": plan, "error": error, **others}
@@ -114,22 +112,22 @@ def pictures_of(name: str, camera: Camera, scene: Scene, device: torch.device) -
     here: list[Tensor] = []
     with torch.no_grad():
         own = copy.deepcopy(camera)
-        cpu = timed("cpu", lambda: here.append(shot(own, scene)), device=torch.device("cpu"), most=0.5)
+        cpu = wall("cpu", lambda: here.append(shot(own, scene)), device=torch.device("cpu"), most=0.5)
         camera, scene = camera.to(device), scene.to(device)
         reference = shot(camera, scene)
-        gpu = timed("gpu", lambda: shot(camera, scene), device=device)
-        rows = [row("reference", relative_rms(reference.cpu(), here[0]), **gpu, **cpu)]
+        gpu = wall("gpu", lambda: shot(camera, scene), device=device)
+        rows = [row("reference", planner.relative_rms(reference.cpu(), here[0]), **gpu, **cpu)]
         for tolerance in TOLERANCES:
             start = time.perf_counter()
             plan = camera.plan(scene, tolerance=tolerance)
             planning = time.perf_counter() - start
             planned = plan.apply(camera)
-            error = relative_rms(shot(planned, scene), reference)
-            gpu = timed("gpu", functools.partial(shot, planned, scene), device=device)
+            error = planner.relative_rms(shot(planned, scene), reference)
+            gpu = wall("gpu", functools.partial(shot, planned, scene), device=device)
             rows.append(row(f"tolerance {tolerance:g}", error, **gpu, planning=planning, changes=str(plan.changes)))
     light = scene.coefficients if scene.spectra is None else scene.spectra
     light.requires_grad_()
-    rows[0] |= timed("gradient", lambda: shot(camera, scene).square().mean().backward(), device=device)
+    rows[0] |= wall("gradient", lambda: shot(camera, scene).square().mean().backward(), device=device)
     return rows
 
 
@@ -146,8 +144,8 @@ def augmentations(device: torch.device, quick: bool) -> list[Row]:
             continue
         augmentation = getattr(KC, name)(p=1.0)
         with torch.no_grad():
-            gpu = timed("gpu", functools.partial(augmentation, there), device=device)
-            cpu = timed("cpu", functools.partial(augmentation, batch), device=torch.device("cpu"), most=0.3)
+            gpu = wall("gpu", functools.partial(augmentation, there), device=device)
+            cpu = wall("cpu", functools.partial(augmentation, batch), device=torch.device("cpu"), most=0.3)
         rows.append({"augmentation": name, "shape": list(shape)} | gpu | cpu)
     return rows
 
@@ -163,7 +161,7 @@ def styles(device: torch.device, quick: bool) -> list[Row]:
     rows: list[Row] = []
 
     def row(what: str, call: Callable[[], Any]) -> None:
-        rows.append({"what": what} | timed("gpu", call, device=device, most=0.1))
+        rows.append({"what": what} | wall("gpu", call, device=device, most=0.1))
 
     pieces, laid = (isp.TextureTransfer(picture, seed=0, steps=count).to(device) for count in (20, 0))
     with torch.no_grad():

@@ -28,15 +28,16 @@ def full_precision(device: torch.device) -> Iterator[None]:
         with torch.autocast(device.type, enabled=False):
             yield
         return
-    before = [(switch, name, getattr(switch, name)) for switch, name, _ in _switches(device)]
-    for switch, name, exact in _switches(device):
+    switches = _switches(device)
+    before = [getattr(switch, name) for switch, name, _ in switches]
+    for switch, name, exact in switches:
         setattr(switch, name, exact)
     try:
         threads = no_more_than_free() if device.type == "cpu" else contextlib.nullcontext()
         with threads, torch.autocast(device.type, enabled=False):
             yield
     finally:
-        for switch, name, value in before:
+        for (switch, name, _), value in zip(switches, before, strict=True):
             setattr(switch, name, value)
 
 

@@ -92,7 +92,6 @@ class _Laid:
         row, column = self.sites // self.width, self.sites % self.width
         self.halves = [self.sites[(row + column) % 2 == part] for part in (0, 1)]
         self.steps = torch.tensor([dy * book.width + dx for dy, dx in BESIDE], device=asked.device)
-        self.beside = {jump: self._beside(row, column, jump) for jump in set(JUMPS)}
         self.allowed = book.places
         widest = max(2, max(book.height, book.width) // 4)
         radii = [widest / 4**k for k in range(math.ceil(math.log(widest, 4)) + 1)]
@@ -114,10 +113,10 @@ class _Laid:
             found.append(places[misfit.argmin(1)])
         return torch.cat(found)
 
-    def _beside(self, row: Tensor, column: Tensor, jump: int) -> tuple[Tensor, Tensor]:
+    def _beside(self, sites: Tensor, jump: int = 1) -> tuple[Tensor, Tensor]:
         """The pixels so far away on four sides, (N,4), and whether they are in the picture."""
-        y, x = (jump * torch.tensor(side, device=row.device) for side in zip(*BESIDE, strict=True))
-        y, x = row[:, None] + y, column[:, None] + x
+        y, x = (jump * torch.tensor(side, device=sites.device) for side in zip(*BESIDE, strict=True))
+        y, x = (sites // self.width)[:, None] + y, (sites % self.width)[:, None] + x
         inside = (y >= 0) & (y < self.height) & (x >= 0) & (x < self.width)
         return y.clamp(0, self.height - 1) * self.width + x.clamp(0, self.width - 1), inside
 
@@ -134,7 +133,7 @@ class _Laid:
             own = self.kept[sites, None]
             misfit = misfit + self.keep * ((places != own) & (own >= 0))
         gain = misfit - self.misfit[sites, None]
-        beside, inside = (part[sites] for part in self.beside[1])
+        beside, inside = self._beside(sites)
         goes_on = (self.places[beside] - self.steps)[:, None]
         theirs, there = book.shows(goes_on), self.shown[beside][:, None]
 
@@ -155,7 +154,7 @@ class _Laid:
 
     def _at_seams(self, sites: Tensor) -> Tensor:
         """Whether two pieces meet at these pixels: inside of one, another place would have seams all around."""
-        beside, inside = (part[sites] for part in self.beside[1])
+        beside, inside = self._beside(sites)
         return (inside & (self.places[beside] - self.steps != self.places[sites, None])).any(1)
 
     def round(self, generator: torch.Generator) -> None:
@@ -166,7 +165,7 @@ class _Laid:
             return torch.rand(*shape, generator=generator, device=generator.device).to(self.asked)
 
         def neighbours(jump: int, sites: Tensor) -> Tensor:
-            beside = self.beside[jump][0][sites]
+            beside, _ = self._beside(sites, jump)
             down = beside // self.width - sites[:, None] // self.width
             right = beside % self.width - sites[:, None] % self.width
             turn, row, column = book.at(self.places[beside])
