@@ -30,12 +30,14 @@ LEAST = 32
 """Pixels of an exemplar's shorter side: four of the coarsest level, of which two are no border."""
 MOST = 2**19
 """Pixels of an exemplar: of a larger one the middle is taken. In eight turns it takes 150 MB."""
-FINE, WIDE = 2.0, 10.0
-"""Gaussians of the tone that is compared, and of what is around it [pixels]."""
-AROUND, NEAR = 16.0, 3.0
+OCTAVES = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Gaussians [pixels]: of the tone that is compared, of its octaves, and last of what is around it."""
+AROUND, NEAR = 16.0, 2.0
 """Gaussians [pixels] of the contrast that is evened out, and of that which says where a picture is even."""
-FAINT, EVENED = 0.25, 0.4
+FAINT, EVENED = 0.25, 0.6
 """Contrast, of the picture's, that counts half where it says what is even, and where it is evened out."""
+GRAIN = 3e-4
+"""Deviation of an octave that counts half: steps of 8-bit values in a smooth sky are no detail."""
 GAIN = 1.5
 """Contrast that is asked for, of the exemplar's: strokes hide some of it."""
 EVEN = 0.01
@@ -52,8 +54,10 @@ FURTHER = (8.0, 16.0, 32.0)
 """Gaussians [pixels] by which directions flow from edges into even areas."""
 FLOW_CELL = 8
 """Pixels between random directions where there are none."""
+SHADE = 5.0
+"""Gaussian of the colours that are compared [pixels]."""
 QUANTILES = 128
-FINISH: dict[str, Any] = {"colour": 1.0, "content": 1.0, "flat": 1e-2}
+FINISH: dict[str, Any] = {"colour": 1.0, "content": 0.5, "flat": 1e-2, "sparse": 0.05}
 """Of the loss that a picture of pieces is moved down on, beside the style's weight of 1."""
 RATE = 0.0075
 KEEP = 1.0
@@ -90,22 +94,24 @@ def _directions(luma: Tensor) -> Tensor:
 
 
 def _tones(luma: Tensor) -> Tensor:
-    """Beside what is around, and around, (2,H,W)."""
-    fine = _blur(luma[None], FINE)
-    wide = _blur(fine, WIDE)
-    return torch.cat([fine - wide, wide])
+    """By octaves, each beside what is around it, and around them all, (5,H,W)."""
+    soft = torch.cat([_blur(luma[None], sigma) for sigma in OCTAVES])
+    return torch.cat([soft[:-1] - soft[1:], soft[-1:]])
+
+
+def _deviation(planes: Tensor) -> Tensor:
+    """Of each of (C,H,W), (C,1,1)."""
+    return planes.std((1, 2), correction=0, keepdim=True)
 
 
 def _standard(planes: Tensor) -> Tensor:
-    """(C,...) of mean 0 and deviation 1; nothing of what does not vary."""
-    flat = planes.flatten(1)
-    spread = flat.std(1, correction=0).clamp(min=1e-4)
-    return (planes - flat.mean(1)[:, None, None]) / spread[:, None, None]
+    """(C,H,W) of mean 0 and deviation 1; nothing of what does not vary."""
+    return (planes - planes.mean((1, 2), keepdim=True)) / _deviation(planes).clamp(min=1e-4)
 
 
 def _colours(picture: Tensor) -> Tensor:
     """Of the neighbourhood, beside its brightness, (2,H,W)."""
-    return _standard(_blur(torch.einsum("nc,chw->nhw", picture.new_tensor(OPPONENT[1:]), picture), WIDE / 2))
+    return _standard(_blur(torch.einsum("nc,chw->nhw", picture.new_tensor(OPPONENT[1:]), picture), SHADE))
 
 
 def _with_tones_of(values: Tensor, others: Tensor) -> Tensor:
@@ -121,7 +127,8 @@ def _with_tones_of(values: Tensor, others: Tensor) -> Tensor:
 
     own, theirs = quantiles(values), quantiles(others)
     flat = values.detach().contiguous()
-    left, right = (torch.searchsorted(own.detach(), flat, right=side) for side in (False, True))
+    slack = 4 * torch.finfo(flat.dtype).eps  # values that are equal differ by rounding
+    left, right = torch.searchsorted(own.detach(), flat - slack), torch.searchsorted(own.detach(), flat + slack)
     index = ((left + right) // 2 - 1).clamp(0, QUANTILES - 2)  # the middle of equal ones
     low, high = own[index], own[index + 1]
     share = ((values - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)
@@ -130,7 +137,7 @@ def _with_tones_of(values: Tensor, others: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Exemplar:
-    """What pieces are taken from: a picture (3,h,w), its tones (2,h,w), in which units what is compared is, and its
+    """What pieces are taken from: a picture (3,h,w), its tones (5,h,w), in which units what is compared is, and its
     places in all turns at all levels.
     """
 
@@ -144,14 +151,14 @@ class _Exemplar:
         luma = _luma(picture)
         tones, slopes = _tones(luma), _directions(luma)
         units = (
-            math.sqrt(detail / max(float(tones[0].detach().var()), 1e-6)),
+            math.sqrt(detail / max(float(tones[:-1].detach().sum(0).var()), 1e-6)),
             1 / max(float(tones.detach().sum(0).std()), 1e-3),
             math.sqrt(flow),
             math.sqrt(colour),
         )
         bare = cls(picture, tones, units, ())
         vectors = slopes[:2] / (slopes[2] + 1e-5)
-        planes = torch.cat([tones, _colours(picture), vectors])
+        planes = torch.cat([tones[:-1].sum(0, keepdim=True), tones[-1:], _colours(picture), vectors])
         parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in LEVELS]
         for turn in range(turns):
             angle = 2 * math.pi * turn / turns
@@ -181,17 +188,22 @@ class _Exemplar:
 def _asked(picture: Tensor, exemplar: _Exemplar, local: float, chance: Tensor) -> tuple[Tensor, ...]:
     """Of (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (1,H,W)."""
     luma = _luma(picture)
-    fine, wide = (part[None] for part in _tones(luma))
-    spread = fine.std(correction=0) + 1e-4
-    near, around = ((_blur(fine.square(), sigma) + 1e-8).sqrt() for sigma in (NEAR, AROUND))
-    weight = EVEN + (1 - EVEN) * near[0] / (near[0] + FAINT * spread)
-    fine = (1 - local) * fine / spread + local * fine / (around + EVENED * spread)
-    theirs = exemplar.tones[0]
-    most = theirs.detach().abs().flatten().kthvalue(math.ceil(0.995 * theirs.numel())).values + 1e-4
-    fine = most * torch.tanh(GAIN * theirs.std() * fine / (fine.std(correction=0) + 1e-4) / most)
-    wide = _with_tones_of(wide, exemplar.tones[1])
-    near = _directions(luma)
-    slopes = near + 0.1 * sum(_blur(near, sigma) for sigma in FURTHER)
+    octaves, wide = _tones(luma).split([len(OCTAVES) - 1, 1])
+    fine = octaves.sum(0, keepdim=True)
+    near = (_blur(fine.square(), NEAR)[0] + 1e-8).sqrt()
+    weight = EVEN + (1 - EVEN) * near / (near + FAINT * (_deviation(fine)[0] + 1e-4))
+    spread = _deviation(octaves) + GRAIN
+    around = (_blur(octaves.square(), AROUND) + 1e-8).sqrt()
+    octaves = (1 - local) * octaves / spread + local * octaves / (around + EVENED * spread)
+    # each as strong, beside the others, as in the exemplar: a picture's wide areas of light and dark are stronger
+    strength = _deviation(exemplar.tones[:-1]) * (1 - GRAIN / spread)
+    fine = (octaves * strength / (_deviation(octaves) + 1e-4)).sum(0, keepdim=True)
+    theirs = exemplar.tones[:-1].sum(0)
+    most = theirs.abs().flatten().kthvalue(math.ceil(0.995 * theirs.numel())).values + 1e-4
+    fine = most * torch.tanh(GAIN * theirs.std() * fine / (_deviation(fine) + 1e-4) / most)
+    wide = _with_tones_of(wide, exemplar.tones[-1])
+    lines = _directions(luma)
+    slopes = lines + 0.1 * sum(_blur(lines, sigma) for sigma in FURTHER)
     known = slopes[2] / (slopes[2] + 1e-4)
     flow = slopes[:2] / (slopes[2] + 1e-9) * known + (1 - known) * chance / (chance.norm(dim=0).mean() + 1e-9)
     flow = 0.8 * flow / (flow.norm(dim=0) + 1e-6)
@@ -248,7 +260,7 @@ def _transferred(
     book = exemplar.books[-1]
     painted = shown_by(book, book.shown, places)
     if isinstance(glaze, Tensor) or glaze:
-        painted = painted + like(glaze, painted) * _blur(tone - _blur(_luma(painted)[None], FINE), GLAZED)
+        painted = painted + like(glaze, painted) * _blur(tone - _blur(_luma(painted)[None], OCTAVES[0]), GLAZED)
     if palette:
         painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
     painted = clip_ste(painted, 0.0, 1.0)[:, :height, :width]
@@ -296,7 +308,7 @@ def texture_transfer(
     picture: Tensor,
     *,
     exemplar: Tensor,
-    detail: float = 8.0,
+    detail: float = 5.0,
     seam: float = 6.0,
     flow: float = 2.0,
     colour: float = 0.0,
@@ -314,12 +326,13 @@ def texture_transfer(
     minimise over places:  detail w (t - t')^2 / var t' + (m - m')^2 / var(t' + m') + flow |v - v'|^2
                            + colour |c - c'|^2 + seam (|where pieces meet|^2 / (2 var) + 0.03)   (`pieces`)
 
-    t is the luma beside what is around it, evened out and of 1.5 times the exemplar's deviation, m that around it,
-    brought to the exemplar's distribution, v the direction of its level lines at twice the angle, c the colour around
-    it; those with a prime are the exemplar's, in each of its turns. w is small where a picture is even: there the
-    exemplar goes on as it is. Directions flow from edges into even areas; where there are none they are drawn. What
-    the pieces show, with the glaze, is brought to the mean and covariance of the exemplar's colours, and then moved a
-    little way down on the loss that cameras are trained by, so that what pieces have broken goes on and a face is one.
+    t is the luma beside what is around it (Gaussians of 1 and 16 pixels), in four octaves, each evened out and as
+    strong beside the others as the exemplar's, all together of 1.5 times its deviation; m is the luma around, brought
+    to the exemplar's distribution, v the direction of level lines at twice the angle, c the colour around; those with
+    a prime are the exemplar's own, in each of its turns. w is small where a picture is even: there the exemplar goes on
+    as it is. Directions flow from edges into even areas; where there are none they are drawn. What the pieces show,
+    with the glaze, is brought to the mean and covariance of the exemplar's colours, and then moved a little way down
+    on the loss that cameras are trained by, so that what pieces have broken goes on and a face is one.
 
     Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
                own pixels; of more than half a megapixel the middle is taken.
@@ -414,7 +427,7 @@ class TextureTransfer(Stage):
         self,
         exemplar: Tensor,
         *,
-        detail: float = 8.0,
+        detail: float = 5.0,
         seam: float = 6.0,
         flow: float = 2.0,
         colour: float = 0.0,

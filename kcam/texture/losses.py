@@ -152,6 +152,7 @@ def correlation_loss(
     window: int = 11,
     whole: bool = False,
     flat: float = 1e-3,
+    sparse: float = 1.0,
 ) -> Tensor:
     """How much of what the scene shows is lost: local correlation of luminance, blind to colour, not to the sign.
 
@@ -163,19 +164,21 @@ def correlation_loss(
     Args:      picture, scene: (B,3,H,W).  levels: factors by which both are averaged first.  window: side [pixels].
                whole: count the whole picture, at full size and as one window, as one level more.
                flat: local variance of luminance below which the scene's contents count less.
+               sparse: the mean is divided by that of w, yet by no less than this: at 1 it is one over all windows; near
+               0 one over those that show something, so that the vessels of a retina count like a picture full of leaves.
     """
     y, t = (x - x.mean((-2, -1), keepdim=True) for x in (luminance(picture), luminance(scene)))  # for rounding alone
     losses = []
     for level in levels:
         coarse = F.avg_pool2d(y, level), F.avg_pool2d(t, level)
         side = min(window, *coarse[0].shape[-2:])
-        losses.append(_lost(*coarse, (side, side), flat))
+        losses.append(_lost(*coarse, (side, side), flat, sparse))
     if whole:
-        losses.append(_lost(y, t, y.shape[-2:], flat))
+        losses.append(_lost(y, t, y.shape[-2:], flat, sparse))
     return torch.stack(losses).mean()
 
 
-def _lost(y: Tensor, t: Tensor, side: tuple[int, ...], flat: float) -> Tensor:
+def _lost(y: Tensor, t: Tensor, side: tuple[int, ...], flat: float, sparse: float) -> Tensor:
     """One level of `correlation_loss`, in windows of some rows and columns."""
     mean_y, mean_t, square_y, square_t, product = F.avg_pool2d(
         torch.cat([y, t, y * y, t * t, y * t], dim=1), side, stride=1
@@ -183,7 +186,9 @@ def _lost(y: Tensor, t: Tensor, side: tuple[int, ...], flat: float) -> Tensor:
     var_y = (square_y - mean_y**2).clamp(min=0) + 1e-5
     var_t = (square_t - mean_t**2).clamp(min=0)
     correlation = (product - mean_y * mean_t) / (var_y * (var_t + 1e-5)).sqrt()
-    return (var_t / (var_t + flat) * (1 - correlation)).mean()
+    weight = var_t / (var_t + flat)
+    weight = weight / weight.mean((1, 2, 3), keepdim=True).clamp(min=sparse)
+    return (weight * (1 - correlation)).mean()
 
 
 # ---- all together -------------------------------------------------------------------------------------------------
@@ -205,7 +210,7 @@ class StyleLoss(nn.Module):
         statistic: "moments" (`moment_loss`) or "gram" (eq. 3.12), the mean and the sum over the layers.
         content_by: "correlation" (`correlation_loss`), or "features": eq. 3.10 at the layer `content_layer`.
         style, colour, content, l2, tv: weights; a term of weight 0 is not computed.
-        levels, window, whole, flat: of the correlation.
+        levels, window, whole, flat, sparse: of the correlation.
         content_layer: of the features, where content_by is "features".
         crop: side of the crops of the style; None: 128 pixels, or the style's shorter side.
     Raises:    ValueError for an unknown name, weights that are negative or all 0, or a style that is too small;
@@ -239,6 +244,7 @@ class StyleLoss(nn.Module):
         window: int = 11,
         whole: bool = False,
         flat: float = 1e-3,
+        sparse: float = 1.0,
         content_layer: str = "relu3_3",
         crop: int | None = None,
     ) -> None:
@@ -258,9 +264,13 @@ class StyleLoss(nn.Module):
             raise ValueError(f"window must be at least 2 pixels, got {window!r}. Use window=11.")
         if not 0 < flat < math.inf:
             raise ValueError(f"flat must be a finite variance > 0, got {flat!r}. Use flat=1e-3.")
+        if not 0 < sparse <= 1:
+            raise ValueError(f"sparse must be a share of the windows within 0..1, not 0, got {sparse!r}. Use sparse=1.")
         self.features = SteerableFeatures() if features is None else features
         self.statistic, self.content_by = statistic, content_by
-        self.correlation: dict[str, Any] = {"levels": tuple(levels), "window": window, "whole": whole, "flat": flat}
+        self.correlation: dict[str, Any] = {
+            "levels": tuple(levels), "window": window, "whole": whole, "flat": flat, "sparse": sparse,
+        }  # fmt: skip
         self.content_layer = content_layer
         with torch.inference_mode(False), torch.no_grad():  # what is made there cannot be differentiated through
             own = picture.clone() if isinstance(picture, Tensor) else picture

@@ -158,6 +158,40 @@ def test_directions_turn_with_the_exemplar() -> None:
         assert between(direction(seen), 0.4 + turn * math.pi / 4) < 0.08
 
 
+def with_spectrum(slope: float, seed: int, *, contrast: float = 0.15) -> Tensor:
+    """Noise (3,96,96) whose amplitude falls as a power of the frequency."""
+    frequency = torch.hypot(torch.fft.fftfreq(96)[:, None], torch.fft.rfftfreq(96)).clamp(min=1 / 96)
+    spectrum = torch.fft.rfft2(torch.randn(96, 96, generator=seeded(seed))) * frequency**-slope
+    noise = torch.fft.irfft2(spectrum, s=(96, 96))
+    return (0.5 + contrast * noise / noise.std()).clamp(0, 1).expand(3, 96, 96)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_asked_for_has_the_octaves_of_the_exemplar(seed: int) -> None:
+    """Whatever falls off with frequency in the picture, and whatever its contrast: random spectra."""
+    low, high = (torch.rand(2, generator=seeded(10 + seed)) * 0.5 + torch.tensor([0.2, 1.2])).tolist()
+    slopes = (low, high) if seed % 2 else (high, low)
+    exemplar = exemplar_of(with_spectrum(slopes[0], seed), turns=1)
+    picture = with_spectrum(slopes[1], 20 + seed, contrast=0.05 + 0.05 * seed)
+    _, _, tone = transfer._asked(picture, exemplar, 1.0, torch.zeros(2, 96, 96))
+    fine = tone[0] - transfer._with_tones_of(transfer._tones(picture[0])[-1], exemplar.tones[-1])
+
+    def shares(tones: Tensor) -> Tensor:
+        found = transfer._deviation(transfer._tones(tones)[:-1]).flatten()
+        return found / found.norm()
+
+    theirs, before = (tones[:-1].sum(0) for tones in (exemplar.tones, transfer._tones(picture[0])))
+    assert float((shares(fine) - shares(theirs)).norm()) < 0.5 * float((shares(before) - shares(theirs)).norm())
+
+
+def test_steps_of_8_bit_values_in_a_smooth_sky_are_no_detail() -> None:
+    exemplar = exemplar_of(painting("strokes", size=96), turns=1)
+    sky = torch.linspace(0.3, 0.7, 96).expand(3, 96, 96)
+    still = torch.zeros(2, 96, 96)
+    smooth, stepped = (transfer._asked(x, exemplar, 1.0, still)[2] for x in (sky, (sky * 255).round() / 255))
+    assert float((smooth - stepped).std()) < 0.25 * float(smooth.std())
+
+
 def test_gradients_of_exemplar_glaze_and_picture(monkeypatch) -> None:
     """With pieces that stay where they are, against differences: float64."""
     laid: list[Tensor] = []

@@ -291,9 +291,24 @@ def test_correlation_by_its_equation(level: int, shape: tuple[int, int], flat: f
     y, t = planes
     covariance = (y * t).mean(-1) - y.mean(-1) * t.mean(-1)
     weight = t.var(-1) / (t.var(-1) + flat)
-    expected = np.mean(weight * (1 - covariance / np.sqrt((y.var(-1) + 1e-5) * (t.var(-1) + 1e-5))))
+    lost = weight * (1 - covariance / np.sqrt((y.var(-1) + 1e-5) * (t.var(-1) + 1e-5)))
+    expected = np.mean(lost)
     assert correlation_loss(picture, scene, levels=(level,), flat=flat).item() == pytest.approx(expected, rel=1e-5)
     assert flat != 1e-3 or correlation_loss(picture, scene, levels=(level,)).item() == pytest.approx(expected, rel=1e-5)
+    shown = weight.mean((1, 2))
+    for sparse in (1e-3, 0.5 * float(shown.sum()), 1.0):  # below both, between them, and above
+        found = correlation_loss(picture, scene, levels=(level,), flat=flat, sparse=sparse).item()
+        assert found == pytest.approx(np.mean(lost.mean((1, 2)) / np.maximum(shown, sparse)), rel=1e-5)
+
+
+def test_a_sparse_scene_counts_like_a_full_one():
+    """What is lost of a scene that shows something in one corner, by what it shows there."""
+    full, lost = noise(1, 3, 64, 64), noise(1, 3, 64, 64, seed=1)
+    corner = torch.full_like(full, 0.5)
+    corner[..., :16, :16] = full[..., :16, :16]
+    ways = [[correlation_loss(lost, x, levels=(1,), sparse=sparse).item() for x in (full, corner)] for sparse in (1, 0.01)]
+    assert ways[0][1] < 0.25 * ways[0][0]
+    assert ways[1][1] > 0.75 * ways[1][0]
 
 
 def test_the_whole_picture_is_a_level_more():
@@ -465,6 +480,9 @@ def test_wrong_styles(picture: Any, error: type[Exception], message: str):
         ({"levels": (0, 1)}, "levels must be whole numbers of at least 1, got (0, 1)."),
         ({"flat": 0.0}, "flat must be a finite variance > 0, got 0.0. Use flat=1e-3."),
         ({"flat": math.nan}, "flat must be a finite variance > 0, got nan."),
+        ({"sparse": 0.0}, "sparse must be a share of the windows within 0..1, not 0, got 0.0. Use sparse=1."),
+        ({"sparse": 1.5}, "sparse must be a share of the windows within 0..1, not 0, got 1.5."),
+        ({"sparse": math.nan}, "sparse must be a share of the windows within 0..1, not 0, got nan."),
         ({"crop": 48}, "crops of 48 pixels are too small: the features need at least 64. Use crop=64."),
         ({"crop": 0}, "crops of 0 pixels are too small"),
     ],
