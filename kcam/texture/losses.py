@@ -164,8 +164,8 @@ def correlation_loss(
     Args:      picture, scene: (B,3,H,W).  levels: factors by which both are averaged first.  window: side [pixels].
                whole: count the whole picture, at full size and as one window, as one level more.
                flat: local variance of luminance below which the scene's contents count less.
-               sparse: the mean is divided by that of w, yet by no less than this: at 1 it is one over all windows; near
-               0 one over those that show something, so that the vessels of a retina count like a picture full of leaves.
+               sparse: the mean is divided by that of w, yet by no less than this. At 1 it is one over all windows, near
+               0 one over those that show something: a face before a wall counts like one among leaves.
     """
     y, t = (x - x.mean((-2, -1), keepdim=True) for x in (luminance(picture), luminance(scene)))  # for rounding alone
     losses = []

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from kcam import Camera, Scene, isp
+from kcam.isp import exemplar as exemplars
 from kcam.isp import pieces, texture_transfer
 from kcam.style import StyleLoss, painting
 
@@ -127,7 +128,7 @@ def test_pieces_cost_nothing_inside_and_offers_lower_the_sum() -> None:
 
 
 def exemplar_of(picture: Tensor, turns: int = 8):
-    return transfer._Exemplar.of(picture, turns=turns, detail=3.0, flow=0.5, colour=0.1)
+    return exemplars.Exemplar.of(picture, turns=turns, detail=3.0, flow=0.5, colour=0.1)
 
 
 def test_the_palette_is_that_of_the_exemplar_and_what_is_brighter_stays_so() -> None:
@@ -137,7 +138,7 @@ def test_the_palette_is_that_of_the_exemplar_and_what_is_brighter_stays_so() -> 
     moved = transfer._with_colours_of(picture, exemplar)
     own, theirs = moved.flatten(1), exemplar.flatten(1)
     assert torch.allclose(own.mean(1), theirs.mean(1), atol=1e-4)
-    before, after = (transfer._luma(x).flatten() for x in (picture, moved))
+    before, after = (exemplars.luma_of(x).flatten() for x in (picture, moved))
     assert torch.equal(before.argsort()[::64], after.argsort()[::64])
     again = transfer._with_colours_of(exemplar + 0.0, exemplar)
     assert torch.allclose(again, exemplar, atol=1e-4)
@@ -173,14 +174,14 @@ def test_what_is_asked_for_has_the_octaves_of_the_exemplar(seed: int) -> None:
     slopes = (low, high) if seed % 2 else (high, low)
     exemplar = exemplar_of(with_spectrum(slopes[0], seed), turns=1)
     picture = with_spectrum(slopes[1], 20 + seed, contrast=0.05 + 0.05 * seed)
-    _, _, tone = transfer._asked(picture, exemplar, 1.0, torch.zeros(2, 96, 96))
-    fine = tone[0] - transfer._with_tones_of(transfer._tones(picture[0])[-1], exemplar.tones[-1])
+    _, _, tone = exemplars.asked_of(picture, exemplar, 1.0, torch.zeros(2, 96, 96))
+    fine = tone[0] - exemplars._with_tones_of(exemplars._tones(picture[0])[-1], exemplar.tones[-1])
 
     def shares(tones: Tensor) -> Tensor:
-        found = transfer._deviation(transfer._tones(tones)[:-1]).flatten()
+        found = exemplars._deviation(exemplars._tones(tones)[:-1]).flatten()
         return found / found.norm()
 
-    theirs, before = (tones[:-1].sum(0) for tones in (exemplar.tones, transfer._tones(picture[0])))
+    theirs, before = (tones[:-1].sum(0) for tones in (exemplar.tones, exemplars._tones(picture[0])))
     assert float((shares(fine) - shares(theirs)).norm()) < 0.5 * float((shares(before) - shares(theirs)).norm())
 
 
@@ -188,7 +189,7 @@ def test_steps_of_8_bit_values_in_a_smooth_sky_are_no_detail() -> None:
     exemplar = exemplar_of(painting("strokes", size=96), turns=1)
     sky = torch.linspace(0.3, 0.7, 96).expand(3, 96, 96)
     still = torch.zeros(2, 96, 96)
-    smooth, stepped = (transfer._asked(x, exemplar, 1.0, still)[2] for x in (sky, (sky * 255).round() / 255))
+    smooth, stepped = (exemplars.asked_of(x, exemplar, 1.0, still)[2] for x in (sky, (sky * 255).round() / 255))
     assert float((smooth - stepped).std()) < 0.25 * float(smooth.std())
 
 
@@ -270,9 +271,9 @@ def test_transforms_without_steps() -> None:
 
 @pytest.mark.parametrize("shape", [(100, 2000), (64, 9000), (40, 1000), (900, 800)])
 def test_a_long_exemplar_keeps_its_shorter_side(shape: tuple[int, int]) -> None:
-    cropped = transfer._cropped(torch.rand(3, 1, 1).expand(3, *shape))
+    cropped = exemplars.cropped(torch.rand(3, 1, 1).expand(3, *shape))
     assert min(cropped.shape[1:]) == min(*(side // 8 * 8 for side in shape), 720)
-    assert cropped[0].numel() <= transfer.MOST
+    assert cropped[0].numel() <= exemplars.MOST
 
 
 def test_a_large_picture_is_moved_in_parts_without_seams(monkeypatch) -> None:
@@ -312,7 +313,7 @@ def test_pictures_of_any_size_and_even_ones(shape: tuple[int, int], value: float
 def test_half_precision_and_large_exemplars() -> None:
     exemplar = torch.rand(3, 800, 900)
     assert isp.texture_transfer(torch.rand(1, 3, 16, 16).half(), exemplar=exemplar).dtype == torch.float16
-    assert 3 * 2**18 < transfer._cropped(exemplar).numel() <= 3 * 2**19
+    assert 3 * 2**18 < exemplars.cropped(exemplar).numel() <= 3 * 2**19
 
 
 def test_saved_and_loaded_it_paints_the_same(tmp_path) -> None:
@@ -356,9 +357,9 @@ def test_it_repaints_pictures_only() -> None:
 
 def test_what_was_made_of_an_exemplar_is_kept_until_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
-    real = transfer._Exemplar.of.__func__
+    real = exemplars.Exemplar.of.__func__
     monkeypatch.setattr(
-        transfer._Exemplar, "of", classmethod(lambda cls, *args, **how: made.append(0) or real(cls, *args, **how))
+        exemplars.Exemplar, "of", classmethod(lambda cls, *args, **how: made.append(0) or real(cls, *args, **how))
     )
     shown = torch.rand(1, 3, 64, 64, generator=seeded())
     stage = isp.TextureTransfer(painting("strokes", size=64), seed=0, turns=1, steps=1)

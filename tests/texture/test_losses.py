@@ -306,7 +306,9 @@ def test_a_sparse_scene_counts_like_a_full_one():
     full, lost = noise(1, 3, 64, 64), noise(1, 3, 64, 64, seed=1)
     corner = torch.full_like(full, 0.5)
     corner[..., :16, :16] = full[..., :16, :16]
-    ways = [[correlation_loss(lost, x, levels=(1,), sparse=sparse).item() for x in (full, corner)] for sparse in (1, 0.01)]
+    ways = [
+        [correlation_loss(lost, x, levels=(1,), sparse=sparse).item() for x in (full, corner)] for sparse in (1, 0.01)
+    ]
     assert ways[0][1] < 0.25 * ways[0][0]
     assert ways[1][1] > 0.75 * ways[1][0]
 
