@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from skimage import data
 from torch import Tensor
 
 from benchmarks import style as benchmark
@@ -117,17 +118,33 @@ def test_what_docs_say_of_pieces() -> None:
         assert pieces["luminance_correlation"] < network["luminance_correlation"]
         assert pieces["detail_correlation"] < laid["detail_correlation"]
         assert all(pieces[name] > laid[name] for name in ("oriented_texture", "patch_swd", "training_loss"))
-        assert committed(style, "pieces")["seen"]["face"] > committed(style, "laid")["seen"]["face"] - 0.005
+        assert committed(style, "pieces")["seen"]["face"] > committed(style, "laid")["seen"]["face"] - 0.03
         own = [row["mean"]["oriented_texture"] for row in rows if row["style"] == style]
         assert max(own) - min(own) < 0.06
     met = {
         name: {style for style in STYLES if all(r["mean"][name] >= aim for r in rows if r["style"] == style)}
         for name, aim in PIECES.items()
     }
-    assert met["oriented_texture"] == set(STYLES) - {"strokes"}
+    assert met["oriented_texture"] == set(STYLES)
     assert met["patch_swd"] == set(STYLES) - {"woodcut"}
-    assert met["detail_correlation"] == {"strokes"}
-    assert min(rows, key=lambda row: row["mean"]["detail_correlation"])["style"] == "hatching"
+    assert met["detail_correlation"] == set(STYLES) - {"pointillism", "hatching"}
+    missed = [PIECES["patch_swd"] - committed("woodcut", "pieces")["mean"]["patch_swd"]]
+    missed += [0.75 - committed(style, "pieces")["mean"]["detail_correlation"] for style in ("pointillism", "hatching")]
+    assert f"by {100 * missed[0]:.0f} %, pointillism and hatching the third, by {missed[1]:.2f} and {missed[2]:.2f}" in TEXT
+
+
+@pytest.mark.slow
+def test_what_docs_say_of_fur() -> None:
+    cat = torch.from_numpy(data.chelsea()[:, 75:375].copy()).permute(2, 0, 1).float() / 255
+    scene = measures._resized(cat, benchmark.SIZE)
+    own, other = benchmark.halves("strokes")
+    for detail, kept, closed in ((5.0, 0.88, 0.47), (1.5, 0.82, 0.64)):
+        shot = isp.texture_transfer(
+            scene[None], exemplar=own, detail=detail, generator=torch.Generator().manual_seed(5)
+        )[0]
+        row = measures.measure(shot, scene=scene, ordinary=scene, style=own, other_style=other)
+        assert row["detail_correlation"] == pytest.approx(kept, abs=0.02)
+        assert row["oriented_texture"] == pytest.approx(closed, abs=0.06)
 
 
 def test_what_docs_say_of_what_is_seen() -> None:
@@ -137,6 +154,8 @@ def test_what_docs_say_of_what_is_seen() -> None:
     assert all(0.55 < seen[style, "stage"]["pixel_noise"] < 0.75 for style in STYLES)  # "two thirds"
     assert all(0.9 < seen[style, "pieces"]["pixel_noise"] < 1.1 for style in STYLES)
     assert seen["mosaic", "stage"]["stroke_length"] > 1.4
+    halos = {style: seen[style, "pieces"]["halo"] for style in STYLES}
+    assert {style for style, halo in halos.items() if halo > 0.13} == {"woodcut", "mosaic"}
 
 
 def test_what_docs_say_of_a_fresh_eye() -> None:
@@ -154,8 +173,8 @@ def test_what_docs_say_of_a_fresh_eye() -> None:
 
 def test_what_docs_say_of_films() -> None:
     assert {row["style"] for row in FILM} == set(STYLES)
-    for name in ("by_themselves", "same_seed"):
-        assert all(0.205 < row[name] < 0.314 for row in FILM)
+    apart = [row[name] for row in FILM for name in ("by_themselves", "same_seed")]
+    assert f"{min(apart):.2f} to {max(apart):.2f} RMS" in TEXT
     assert all(0.02 < row["film"] < 0.04 for row in FILM)
     assert all(0.028 < row["frames"] < 0.03 for row in FILM)
     assert all(abs(row["detail"]["film"] - row["detail"]["by_themselves"]) < 0.01 for row in FILM)
