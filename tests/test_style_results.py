@@ -128,9 +128,13 @@ def test_what_docs_say_of_pieces() -> None:
     assert met["oriented_texture"] == set(STYLES)
     assert met["patch_swd"] == set(STYLES) - {"woodcut"}
     assert met["detail_correlation"] == set(STYLES) - {"pointillism", "hatching"}
-    missed = [PIECES["patch_swd"] - committed("woodcut", "pieces")["mean"]["patch_swd"]]
-    missed += [0.75 - committed(style, "pieces")["mean"]["detail_correlation"] for style in ("pointillism", "hatching")]
-    assert f"by {100 * missed[0]:.0f} %, pointillism and hatching the third, by {missed[1]:.2f} and {missed[2]:.2f}" in TEXT
+
+    def missing_of(style: str, name: str) -> float:
+        return PIECES[name] - committed(style, "pieces")["mean"][name]
+
+    assert f"misses the second, by {100 * missing_of('woodcut', 'patch_swd'):.0f} %" in TEXT
+    dots, lines = (missing_of(style, "detail_correlation") for style in ("pointillism", "hatching"))
+    assert f"pointillism and hatching the third, by {dots:.2f} and {lines:.2f}" in TEXT
 
 
 @pytest.mark.slow
