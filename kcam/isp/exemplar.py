@@ -33,6 +33,8 @@ GAIN = 1.5
 """Contrast that is asked for, of the exemplar's: strokes hide some of it."""
 EVEN = 0.01
 """Share of its weight that the tone keeps where the picture is even: there the exemplar's own texture is free."""
+SPARSEST = 0.25
+"""Of `_fullness`, as far as it counts."""
 SLOPE, ALONG = 1.0, 4.0
 """Gaussians of the slopes whose directions are compared, and of their average [pixels]."""
 FURTHER = (8.0, 16.0, 32.0)
@@ -175,13 +177,21 @@ def _in_proportion(octaves: Tensor, theirs: Tensor, local: float) -> Tensor:
     return most * torch.tanh(GAIN * whole.std() * fine / (_deviation(fine) + 1e-4) / most)
 
 
+def _fullness(tone: Tensor) -> float:
+    """How much of a picture shows something: 1 where tones are as in noise, near 0 where few pixels have all of it."""
+    mean, square = float(tone.abs().mean()) + GRAIN, float(tone.square().mean()) + GRAIN**2
+    return min(max(math.pi / 2 * mean**2 / square, SPARSEST), 1.0)
+
+
 def asked_of(picture: Tensor, exemplar: Exemplar, local: float, chance: Tensor) -> tuple[Tensor, ...]:
     """Of (3,H,W): what pieces should be like (6,H,W), how much the tone counts (H,W), and the tone (1,H,W)."""
     luma = luma_of(picture)
     octaves, wide = _tones(luma).split([len(OCTAVES) - 1, 1])
     fine = octaves.sum(0, keepdim=True)
-    near = (blur(fine.square(), NEAR)[0] + 1e-8).sqrt()
-    weight = EVEN + (1 - EVEN) * near / (near + FAINT * (_deviation(fine)[0] + 1e-4))
+    with torch.no_grad():  # where little shows something, strokes all around hide it: what there is must be met
+        near = blur(fine.square(), NEAR)[0].clamp(min=0).sqrt()
+        weight = EVEN + (1 - EVEN) * near / (near + FAINT * _deviation(fine)[0] + GRAIN)
+        weight = weight / _fullness(fine) ** 2
     fine = _in_proportion(octaves, exemplar.tones[:-1], local)
     wide = _with_tones_of(wide, exemplar.tones[-1])
     lines = _directions(luma)

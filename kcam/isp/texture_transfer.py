@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import torch
+from kornia.filters import guided_blur
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -37,11 +38,11 @@ ROUNDS = (12, 10, 8, 4)
 """How often pieces of each level are offered others."""
 JOINT = 0.03
 """What a seam costs where its colours agree: without it even areas are the same few pixels again and again."""
-GLAZED = 3.0
-"""Gaussian of the tone that is laid over [pixels]: it spares the strokes."""
+GLAZED, STROKE = 17, 4e-3
+"""Side of the windows in which what is laid over follows the strokes [pixels], and variance of what is none."""
 STEADY = 0.1
 """Of the exemplar's covariance of colours, added to both: of a picture that shows one tone little is made."""
-FINISH: dict[str, Any] = {"colour": 1.0, "content": 0.5, "flat": 1e-2, "sparse": 0.05}
+FINISH: dict[str, Any] = {"colour": 1.0, "content": 0.3, "flat": 1e-2, "sparse": 0.05}
 """Of the loss that a picture of pieces is moved down on, beside the style's weight of 1."""
 RATE = 0.0075
 KEEP = 1.0
@@ -91,11 +92,17 @@ def _transferred(
     book = exemplar.books[-1]
     painted = shown_by(book, book.shown, places)
     if isinstance(glaze, Tensor) or glaze:
-        painted = painted + like(glaze, painted) * blur(tone - blur(luma_of(painted)[None], OCTAVES[0]), GLAZED)
+        painted = painted + like(glaze, painted) * _by_strokes(tone - blur(luma_of(painted)[None], OCTAVES[0]), painted)
     if palette:
         painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
     painted = clip_ste(painted, 0.0, 1.0)[:, :height, :width]
     return painted if loss is None else _finished(painted, picture, loss, steps), (places, chance)
+
+
+def _by_strokes(tone: Tensor, painted: Tensor) -> Tensor:
+    """(1,H,W) evened out within each stroke, not over its edge: a soft shadow would look like a photograph's."""
+    guide = luma_of(painted)[None, None]
+    return guided_blur(guide, tone[None], GLAZED, STROKE, border_type="replicate", separable=True)[0]
 
 
 def _finished(painted: Tensor, scene: Tensor, loss: StyleLoss, steps: int) -> Tensor:
@@ -139,7 +146,7 @@ def texture_transfer(
     picture: Tensor,
     *,
     exemplar: Tensor,
-    detail: float = 5.0,
+    detail: float = 4.0,
     seam: float = 6.0,
     flow: float = 2.0,
     colour: float = 0.0,
@@ -161,14 +168,15 @@ def texture_transfer(
     strong beside the others as the exemplar's, all together of 1.5 times its deviation; m is the luma around, brought
     to the exemplar's distribution, v the direction of level lines at twice the angle, c the colour around; those with
     a prime are the exemplar's own, in each of its turns. w is small where a picture is even: there the exemplar goes on
-    as it is. Directions flow from edges into even areas; where there are none they are drawn. What the pieces show,
+    as it is; and the larger the fewer places of a picture show something, which strokes all around would hide:
+    (pi/2 mean(|t|)^2 / mean(t^2))^-2, 1 where tones are as in noise and at most 16. Directions flow from edges into even areas; where there are none they are drawn. What the pieces show,
     with the glaze, is brought to the mean and covariance of the exemplar's colours, and then moved a little way down
     on the loss that cameras are trained by, so that what pieces have broken goes on and a face is one.
 
     Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
                own pixels; of more than half a megapixel the middle is taken.
                detail, seam, flow, colour: weights, >= 0.  local: share of the contrast that is evened out, 0..1.
-               glaze: share of t + m, as far as the pieces do not show it, that is laid over them softly, >= 0.
+               glaze: share of t + m, as far as the pieces do not show it, that is laid over them, by strokes, >= 0.
                palette: share of the way to the exemplar's colours, 0..1.
                turns: of the exemplar, evenly spread over a whole one; 1 leaves its strokes as they lie.
                steps: down on the loss (`style.StyleLoss`), a third of the time; none where the picture or the exemplar
@@ -184,7 +192,8 @@ def texture_transfer(
     Raises:    TypeError, ValueError for what is no picture, NaN, or an exemplar that is too small or flat.
     Source:    Efros and Freeman, Image quilting for texture synthesis and transfer, SIGGRAPH 2001, texture transfer;
                Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns; Reinhard et al., Color
-               transfer between images (2001), the palette, with covariances, triangular from the luma on.
+               transfer between images (2001), the palette, with covariances, triangular from the luma on; He, Sun and Tang,
+               Guided image filtering, ECCV 2010, the glaze.
 
     Example:
     >>> stripes = (torch.arange(64) % 8 < 4).float().expand(3, 64, 64) * 0.8 + 0.1
@@ -250,7 +259,7 @@ class TextureTransfer(Stage):
         self,
         exemplar: Tensor,
         *,
-        detail: float = 5.0,
+        detail: float = 4.0,
         seam: float = 6.0,
         flow: float = 2.0,
         colour: float = 0.0,
