@@ -168,10 +168,11 @@ def texture_transfer(
     strong beside the others as the exemplar's, all together of 1.5 times its deviation; m is the luma around, brought
     to the exemplar's distribution, v the direction of level lines at twice the angle, c the colour around; those with
     a prime are the exemplar's own, in each of its turns. w is small where a picture is even: there the exemplar goes on
-    as it is; and the larger the fewer places of a picture show something, which strokes all around would hide:
-    (pi/2 mean(|t|)^2 / mean(t^2))^-2, 1 where tones are as in noise and at most 16. Directions flow from edges into even areas; where there are none they are drawn. What the pieces show,
-    with the glaze, is brought to the mean and covariance of the exemplar's colours, and then moved a little way down
-    on the loss that cameras are trained by, so that what pieces have broken goes on and a face is one.
+    as it is. All of it is the larger the fewer places show something, since strokes all around would hide that: by
+    (pi/2 mean(|t|)^2 / mean(t^2))^-2, 1 where tones are as in noise and at most 16. Directions flow from edges into
+    even areas; where there are none they are drawn. What the pieces show, with the glaze, is brought to the mean and
+    covariance of the exemplar's colours, and then moved a little way down on the loss that cameras are trained by, so
+    that what pieces have broken goes on and a face is one.
 
     Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
                own pixels; of more than half a megapixel the middle is taken.
@@ -192,8 +193,8 @@ def texture_transfer(
     Raises:    TypeError, ValueError for what is no picture, NaN, or an exemplar that is too small or flat.
     Source:    Efros and Freeman, Image quilting for texture synthesis and transfer, SIGGRAPH 2001, texture transfer;
                Hertzmann et al., Image analogies, SIGGRAPH 2001, by luminance and in turns; Reinhard et al., Color
-               transfer between images (2001), the palette, with covariances, triangular from the luma on; He, Sun and Tang,
-               Guided image filtering, ECCV 2010, the glaze.
+               transfer between images (2001), the palette, with covariances, triangular from the luma on; He,
+               Sun and Tang, Guided image filtering, ECCV 2010, the glaze.
 
     Example:
     >>> stripes = (torch.arange(64) % 8 < 4).float().expand(3, 64, 64) * 0.8 + 0.1

@@ -205,7 +205,8 @@ def woodcut(shape: tuple[int, int], rng: Generator) -> Array:
     starts, ink = np.array([*(start for start, _ in INKS), 1.0]), fields.ink_index(INKS, tone)
     across = (tone - starts[ink]) / (starts[ink + 1] - starts[ink])
     shading = 1.0 - 1.1 * across + 0.25 * fields.noise(shape, rng, WAVE / 2)
-    cut = fields.smooth_step(lines - 0.75 + shading, 0.5)[..., None]
+    depth = lines - 0.75 + shading
+    cut = fields.smooth_step(depth, np.maximum(0.5, 1.5 * np.hypot(*fields.gradient(depth))))[..., None]  # no stairs
     picture = picture + cut * (fields.colours(CUTS, tone) - picture)
     slope = np.hypot(*fields.gradient(tone)) + 1e-4
     distance = np.min([abs(tone - start) for start in starts[1:-1]], axis=0) / slope  # pixels, to first order

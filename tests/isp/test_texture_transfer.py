@@ -193,6 +193,37 @@ def test_steps_of_8_bit_values_in_a_smooth_sky_are_no_detail() -> None:
     assert float((smooth - stepped).std()) < 0.25 * float(smooth.std())
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_tone_of_a_picture_that_shows_little_counts_more(seed: int) -> None:
+    """Noise on a random part of a wall, of random contrast: the smaller the part, the more its tone counts there."""
+    exemplar = exemplar_of(painting("strokes", size=96), turns=1)
+    noise = torch.randn(96, 96, generator=seeded(seed))
+    contrast, brightness = (0.02 + 0.2 * torch.rand(2, generator=seeded(30 + seed))).tolist()
+    counts = []
+    for side in (96, 48, 24, 12):
+        part = torch.zeros(96, 96)
+        part[:side, :side] = noise[:side, :side]
+        picture = (0.3 + brightness + contrast * part).expand(3, 96, 96)
+        weight = exemplars.asked_of(picture, exemplar, 1.0, torch.zeros(2, 96, 96))[1]
+        counts.append(float(weight[:side, :side].mean()))
+    assert counts == sorted(counts)
+    assert counts[-1] > 8 * counts[0]
+    wall = exemplars.asked_of(torch.full((3, 96, 96), brightness), exemplar, 1.0, torch.zeros(2, 96, 96))[1]
+    assert float(wall.max()) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_laid_over_follows_the_strokes(seed: int) -> None:
+    """Random cells of random colours, each to be made so much brighter: a Gaussian would cross their edges."""
+    at, tones = torch.rand(40, 2, generator=seeded(seed)) * 96, torch.rand(2, 40, generator=seeded(40 + seed))
+    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="ij")
+    cell = (torch.stack([rows, columns], -1)[:, :, None] - at).square().sum(-1).argmin(-1)
+    painted, wanted = tones[0][cell].expand(3, 96, 96), 0.2 * tones[:1, cell]
+    noisy = wanted + 0.1 * torch.randn(1, 96, 96, generator=seeded(50 + seed))
+    off = float((transfer._by_strokes(noisy, painted) - wanted).square().mean())
+    assert off < 0.7 * min(float((exemplars.blur(noisy, sigma) - wanted).square().mean()) for sigma in (2.0, 3.0, 5.0))
+
+
 def test_gradients_of_exemplar_glaze_and_picture(monkeypatch) -> None:
     """With pieces that stay where they are, against differences: float64."""
     laid: list[Tensor] = []
