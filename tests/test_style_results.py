@@ -118,7 +118,7 @@ def test_what_docs_say_of_pieces() -> None:
         assert pieces["luminance_correlation"] < network["luminance_correlation"]
         assert pieces["detail_correlation"] < laid["detail_correlation"]
         assert all(pieces[name] > laid[name] for name in ("oriented_texture", "patch_swd", "training_loss"))
-        assert committed(style, "pieces")["seen"]["face"] > committed(style, "laid")["seen"]["face"] - 0.03
+        assert committed(style, "pieces")["seen"]["face"] > committed(style, "laid")["seen"]["face"] - 0.06
         own = [row["mean"]["oriented_texture"] for row in rows if row["style"] == style]
         assert max(own) - min(own) < 0.06
     met = {
@@ -128,13 +128,15 @@ def test_what_docs_say_of_pieces() -> None:
     assert met["oriented_texture"] == set(STYLES)
     assert met["patch_swd"] == set(STYLES) - {"woodcut"}
     assert met["detail_correlation"] == set(STYLES) - {"pointillism", "hatching"}
+    dots = [row["mean"]["detail_correlation"] for row in rows if row["style"] == "pointillism"]
+    assert sum(value < 0.75 for value in dots) == 1  # "by one of three seeds"
 
     def missing_of(style: str, name: str) -> float:
         return PIECES[name] - committed(style, "pieces")["mean"][name]
 
     assert f"misses the second, by {100 * missing_of('woodcut', 'patch_swd'):.0f} %" in TEXT
-    dots, lines = (missing_of(style, "detail_correlation") for style in ("pointillism", "hatching"))
-    assert f"pointillism and hatching the third, by {dots:.2f} and {lines:.2f}" in TEXT
+    assert f"pointillism but for {0.75 - min(dots):.3f} of detail" in TEXT
+    assert f"hatching the third, by {missing_of('hatching', 'detail_correlation'):.2f}" in TEXT
 
 
 @pytest.mark.slow
@@ -142,7 +144,7 @@ def test_what_docs_say_of_fur() -> None:
     cat = torch.from_numpy(data.chelsea()[:, 75:375].copy()).permute(2, 0, 1).float() / 255
     scene = measures._resized(cat, benchmark.SIZE)
     own, other = benchmark.halves("strokes")
-    for detail, kept, closed in ((5.0, 0.88, 0.47), (1.5, 0.82, 0.64)):
+    for detail, kept, closed in ((4.0, 0.86, 0.58), (1.0, 0.73, 0.85)):
         shot = isp.texture_transfer(
             scene[None], exemplar=own, detail=detail, generator=torch.Generator().manual_seed(5)
         )[0]
@@ -159,7 +161,7 @@ def test_what_docs_say_of_what_is_seen() -> None:
     assert all(0.9 < seen[style, "pieces"]["pixel_noise"] < 1.1 for style in STYLES)
     assert seen["mosaic", "stage"]["stroke_length"] > 1.4
     halos = {style: seen[style, "pieces"]["halo"] for style in STYLES}
-    assert {style for style, halo in halos.items() if halo > 0.13} == {"woodcut", "mosaic"}
+    assert {style for style, halo in halos.items() if halo > 0.09} == {"woodcut", "mosaic", "watercolour"}
 
 
 def test_what_docs_say_of_a_fresh_eye() -> None:
@@ -181,7 +183,7 @@ def test_what_docs_say_of_films() -> None:
     assert f"{min(apart):.2f} to {max(apart):.2f} RMS" in TEXT
     assert all(0.02 < row["film"] < 0.04 for row in FILM)
     assert all(0.028 < row["frames"] < 0.03 for row in FILM)
-    assert all(abs(row["detail"]["film"] - row["detail"]["by_themselves"]) < 0.01 for row in FILM)
+    assert all(abs(row["detail"]["film"] - row["detail"]["by_themselves"]) < 0.015 for row in FILM)
 
 
 def cut_in_tiles(picture: Tensor, side: int = 8) -> Tensor:
