@@ -32,6 +32,11 @@ AT_ONCE = 2**15  # pixels
 SOFT = 0.5  # pixels: Gaussian by which pieces are averaged where they meet
 
 
+def picked(table: Tensor, index: Tensor) -> Tensor:
+    """table[index], four times as fast."""
+    return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
+
+
 @dataclass(frozen=True)
 class Book:
     """The places of an exemplar in all its turns, at one size: a place is an index into the tables.
@@ -61,11 +66,11 @@ class Book:
         inside = (row >= 0) & (row < self.height) & (column >= 0) & (column < self.width)
         row, column = row.clamp(0, self.height - 1), column.clamp(0, self.width - 1)
         found = (turn * self.height + row) * self.width + column
-        return torch.where(inside & self.allowed[found], found, otherwise)
+        return torch.where(inside & picked(self.allowed, found), found, otherwise)
 
     def shows(self, places: Tensor) -> Tensor:
         """What is seen one step beside a place, (...,3): there is something all around the allowed ones."""
-        return self.shown[places.clamp(0, len(self.shown) - 1)]
+        return picked(self.shown, places.clamp(0, len(self.shown) - 1))
 
 
 def turned(planes: Tensor, angle: float, *, mode: str = "bilinear") -> tuple[Tensor, Tensor]:
@@ -121,41 +126,54 @@ class _Laid:
         return y.clamp(0, self.height - 1) * self.width + x.clamp(0, self.width - 1), inside
 
     def offer(self, sites: Tensor, places: Tensor) -> None:
-        """Take the best of some places (N,K) at each of these pixels (N,), no two of them neighbours, if it helps."""
+        """Take the best of some places (N,K) at each of these pixels (N,), no two of them neighbours, if it helps.
+
+        Seams cost nothing or something: where a place fits worse by more than its pixel's seams cost now, its own need
+        not be known.
+        """
         book = self.book
-        news = (places != self.places[sites, None]).any(1)
-        sites, places = sites[news], places[news]
-        if not len(sites):
+        other = places != picked(self.places, sites)[:, None]
+        some = other.any(1).nonzero()[:, 0]
+        if not len(some):
             return
-        now = self.places[sites, None]
-        misfit = (self.weights[sites, None] * (book.compared[places] - self.asked[sites, None]).square()).sum(2)
-        if self.kept is not None:
-            own = self.kept[sites, None]
-            misfit = misfit + self.keep * ((places != own) & (own >= 0))
-        gain = misfit - self.misfit[sites, None]
+        sites, places, other = (picked(given, some) for given in (sites, places, other))
         beside, inside = self._beside(sites)
-        goes_on = (self.places[beside] - self.steps)[:, None]
-        theirs, there = book.shows(goes_on), self.shown[beside][:, None]
+        goes_on, there = picked(self.places, beside) - self.steps, picked(self.shown, beside)
+        theirs = book.shows(goes_on)
 
-        def seams(places: Tensor) -> Tensor:
-            """What they cost on all sides, (N,K)."""
-            cost = (book.shown[places][:, :, None] - theirs).square().sum(3)
-            cost += (book.shows(places[..., None] + self.steps) - there).square().sum(3)
-            cost += self.joint * (places[..., None] != goes_on)
-            return (cost * inside[:, None]).sum(2)
+        def seams(places: Tensor, at: Tensor) -> Tensor:
+            """What they cost on all sides of such pixels of those above, (N,)."""
+            cost = (picked(book.shown, places)[:, None] - picked(theirs, at)).square().sum(2)
+            cost += (book.shows(places[:, None] + self.steps) - picked(there, at)).square().sum(2)
+            cost += self.joint * (places[:, None] != picked(goes_on, at))
+            return self.seam * (cost * picked(inside, at)).sum(1)
 
-        gain += self.seam * (seams(places) - seams(now))
-        gain, best = gain.min(1)
-        taken = gain < 0
-        sites, best = sites[taken], best[taken, None]
-        self.places[sites] = places[taken].gather(1, best)[:, 0]
-        self.misfit[sites] = misfit[taken].gather(1, best)[:, 0]
-        self.shown[sites] = book.shown[self.places[sites]]
+        now = seams(picked(self.places, sites), torch.arange(len(sites), device=sites.device))
+        pairs = other.flatten().nonzero()[:, 0]
+        at, found = pairs // places.shape[1], picked(places.flatten(), pairs)
+        here = picked(sites, at)
+        apart = picked(book.compared, found) - picked(self.asked, here)
+        misfit = (picked(self.weights, here) * apart.square()).sum(1)
+        if self.kept is not None:
+            own = picked(self.kept, here)
+            misfit = misfit + self.keep * ((found != own) & (own >= 0))
+        worse = misfit - picked(self.misfit, here) - picked(now, at)
+        able = (worse < 0).nonzero()[:, 0]
+        pairs, at, found, misfit, worse = (picked(given, able) for given in (pairs, at, found, misfit, worse))
+        gains, misfits = misfit.new_zeros(2, *places.shape)
+        gains.view(-1)[pairs] = worse + seams(found, at)
+        misfits.view(-1)[pairs] = misfit
+        gain, best = gains.min(1)
+        taken = (gain < 0).nonzero()[:, 0]
+        sites, best = picked(sites, taken), picked(best, taken)[:, None]
+        self.places[sites] = places = picked(places, taken).gather(1, best)[:, 0]
+        self.misfit[sites] = picked(misfits, taken).gather(1, best)[:, 0]
+        self.shown[sites] = picked(book.shown, places)
 
     def _at_seams(self, sites: Tensor) -> Tensor:
         """Whether two pieces meet at these pixels: inside of one, another place would have seams all around."""
         beside, inside = self._beside(sites)
-        return (inside & (self.places[beside] - self.steps != self.places[sites, None])).any(1)
+        return (inside & (picked(self.places, beside) - self.steps != picked(self.places, sites)[:, None])).any(1)
 
     def round(self, generator: torch.Generator) -> None:
         """Offer to each pixel the pieces of its neighbours, places near its own, and some by chance."""
@@ -168,18 +186,18 @@ class _Laid:
             beside, _ = self._beside(sites, jump)
             down = beside // self.width - sites[:, None] // self.width
             right = beside % self.width - sites[:, None] % self.width
-            turn, row, column = book.at(self.places[beside])
-            return book.place(turn, row - down, column - right, self.places[sites, None])
+            turn, row, column = book.at(picked(self.places, beside))
+            return book.place(turn, row - down, column - right, picked(self.places, sites)[:, None])
 
         def near(sites: Tensor) -> Tensor:
-            turn, row, column = (part[:, None] for part in book.at(self.places[sites]))
+            own = picked(self.places, sites)[:, None]
+            turn, row, column = book.at(own)
             down, right = ((draw(len(sites), len(self.radii)) * 2 - 1) * self.radii for _ in range(2))
-            own = self.places[sites, None]
             return book.place(turn, row + down.round().long(), column + right.round().long(), own)
 
         def anywhere(sites: Tensor) -> Tensor:
             count = CHANCES if len(self.sites) < SMALL else FEW
-            return allowed[(draw(len(sites), count) * len(allowed)).long().clamp(max=len(allowed) - 1)]
+            return picked(allowed, (draw(len(sites), count) * len(allowed)).long().clamp(max=len(allowed) - 1))
 
         ways: list[Callable[[Tensor], Tensor]] = [partial(neighbours, jump) for jump in JUMPS]
         for offers in (*ways, near, anywhere):
@@ -250,6 +268,6 @@ def shown_by(book: Book, table: Tensor, places: Tensor) -> Tensor:
         share = math.exp(-(dy * dy + dx * dx) / (2 * SOFT**2))
         down, right = (rows + dy).clamp(0, height - 1) - rows, (columns + dx).clamp(0, width - 1) - columns
         there = places[rows + down][:, columns + right] - down[:, None] * book.width - right
-        total = total + share * table[there.flatten().clamp(0, len(table) - 1)]
+        total = total + share * picked(table, there.flatten().clamp(0, len(table) - 1))
         weight += share
     return (total / weight).T.unflatten(1, (height, width))  # type: ignore[union-attr]
