@@ -136,6 +136,8 @@ def picture(*shape: int) -> Tensor:
 
 ELSEWHERE = {"texture transfer": math.inf, "style stage": 1e-3, "JPEG": 0.01}
 """Other rounding may choose another piece, or step; a network's convolutions are as torch has them, in TF32."""
+PRETENDED = {"texture transfer": 0.01}
+"""Kornia's boxes are rounded otherwise where it knows no CPU, and the steps go by the signs of slopes."""
 STAGES: dict[str, Callable[[], nn.Module]] = {
     "style stage": lambda: painting_stage().mean(),
     "texture transfer": lambda: isp.TextureTransfer(style.painting("strokes", size=64), seed=0, steps=2),
@@ -160,7 +162,7 @@ def test_stages_of_pictures(name: str, device: torch.device) -> None:
     assert there.isfinite().all()
     off = (there.cpu() - here).square().mean().sqrt()
     assert (there.cpu() - here).mean((0, 2, 3)).abs().max() < 0.05  # other pieces, of the same painting
-    assert off < (ROUNDING if device.type == pretend.NAME else ELSEWHERE.get(name, ROUNDING))
+    assert off < (PRETENDED if device.type == pretend.NAME else ELSEWHERE).get(name, ROUNDING)
 
 
 ASKED: dict[str, Callable[[Camera, Scene], Any]] = {
