@@ -45,6 +45,8 @@ STEADY = 0.1
 FINISH: dict[str, Any] = {"colour": 1.0, "content": 0.3, "flat": 1e-2, "sparse": 0.05}
 """Of the loss that a picture of pieces is moved down on, beside the style's weight of 1."""
 RATE = 0.0075
+PAINTS, ALIKE = 512, 0.04
+"""Pixels of the exemplar whose colours are its paints, and deviation of colours that count as the same."""
 KEEP = 1.0
 """What it costs in a film that a pixel leaves the piece that it was of."""
 AT_ONCE, SHARED = 1024, 64
@@ -96,7 +98,12 @@ def _transferred(
     if palette:
         painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
     painted = clip_ste(painted, 0.0, 1.0)[:, :height, :width]
-    return painted if loss is None else _finished(painted, picture, loss, steps), (places, chance)
+    if loss is not None:
+        moved = _finished(painted, picture, loss, steps)
+        if palette:
+            moved = torch.lerp(moved, _with_colours_of(_by_paints(moved, exemplar.picture), exemplar.picture), palette)
+        painted = painted + (moved.clamp(0, 1) - painted).detach()
+    return painted, (places, chance)
 
 
 def _by_strokes(tone: Tensor, painted: Tensor) -> Tensor:
@@ -106,7 +113,7 @@ def _by_strokes(tone: Tensor, painted: Tensor) -> Tensor:
 
 
 def _finished(painted: Tensor, scene: Tensor, loss: StyleLoss, steps: int) -> Tensor:
-    """(3,H,W) some steps down the loss, whose slope goes through: where pieces meet it mends what no piece could."""
+    """(3,H,W) some steps down the loss: where pieces meet it mends what no piece could."""
     height, width = painted.shape[-2:]
     total, weights = torch.zeros_like(painted), torch.zeros_like(painted[:1])
     for rows, down in _parts(height):
@@ -117,7 +124,7 @@ def _finished(painted: Tensor, scene: Tensor, loss: StyleLoss, steps: int) -> Te
             share = down[:, None].to(part) * right.to(part)
             total[:, rows, columns] += share * part[0]
             weights[:, rows, columns] += share
-    return painted + (total / weights - painted).detach()
+    return total / weights
 
 
 def _parts(length: int) -> list[tuple[slice, Tensor]]:
@@ -139,6 +146,19 @@ def _with_colours_of(picture: Tensor, other: Tensor) -> Tensor:
     back = torch.linalg.inv(basis) @ want
     moved = back @ torch.linalg.solve_triangular(have, own - own.mean(1, keepdim=True), upper=False)
     return (moved + other.flatten(1).mean(1, keepdim=True)).view_as(picture)
+
+
+@torch.no_grad()
+def _by_paints(picture: Tensor, exemplar: Tensor) -> Tensor:
+    """As bright as it is, in what the exemplar has of such colours: a loss also tints what no paint would."""
+    flat = exemplar.flatten(1)
+    some = torch.randperm(flat.shape[1], generator=torch.Generator().manual_seed(0))[:PAINTS]
+    paints, basis = flat[:, some.to(flat.device)].T, flat.new_tensor((LUMINANCE, *OPPONENT[1:]))
+    parts = []
+    for part in picture.flatten(1).T.split(AT_ONCE**2 // 64):
+        mixed = torch.softmax(torch.cdist(part, paints).square() / (-2 * ALIKE**2), dim=1) @ paints
+        parts.append(torch.cat([part @ basis[:1].T, mixed @ basis[1:].T], dim=1))
+    return (torch.cat(parts) @ torch.linalg.inv(basis).T).T.view_as(picture)
 
 
 @in_float32
@@ -172,7 +192,7 @@ def texture_transfer(
     (pi/2 mean(|t|)^2 / mean(t^2))^-2, 1 where tones are as in noise and at most 16. Directions flow from edges into
     even areas; where there are none they are drawn. What the pieces show, with the glaze, is brought to the mean and
     covariance of the exemplar's colours, and then moved a little way down on the loss that cameras are trained by, so
-    that what pieces have broken goes on and a face is one.
+    that what pieces have broken goes on and a face is one, in colours that the exemplar has.
 
     Args:      picture: (B,3,H,W) sRGB in [0,1].  exemplar: (3,h,w) sRGB in [0,1], at least 32 pixels each way, at its
                own pixels; of more than half a megapixel the middle is taken.
