@@ -146,6 +146,21 @@ def test_the_palette_is_that_of_the_exemplar_and_what_is_brighter_stays_so() -> 
     assert float(even.flatten(1).std(1).max()) < 0.15  # 1.1 / 0.1 of the variance at most
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_shown_is_mixed_from_the_paints_of_the_exemplar(seed: int) -> None:
+    """Two random paints, mixed: all colours lie on the line between them, whatever the loss would tint."""
+    paints = torch.rand(2, 3, generator=seeded(60 + seed))
+    share = painting("strokes", size=96)[1]
+    exemplar = torch.lerp(paints[0][:, None, None], paints[1][:, None, None], share)
+    painted = texture_transfer(torch.rand(1, 3, 72, 80, generator=seeded(seed)), exemplar=exemplar, generator=seeded())
+    along = F.normalize(paints[1] - paints[0], dim=0)
+    apart = (painted[0] - paints[0][:, None, None]).flatten(1).T
+    off = apart - (apart @ along)[:, None] * along
+    assert float(off.norm(dim=1).quantile(0.99)) < 0.02
+    spread = [float((flat.flatten(1).T - paints[0]).matmul(along).std()) for flat in (painted[0], exemplar)]
+    assert spread[0] == pytest.approx(spread[1], rel=0.15)
+
+
 def test_directions_turn_with_the_exemplar() -> None:
     """Those of a turned picture are the turned ones."""
     exemplar = exemplar_of(stripes(96, angle=0.4, period=6.0), turns=8)
