@@ -166,15 +166,20 @@ def test_what_docs_say_of_what_is_seen() -> None:
 
 def test_what_docs_say_of_a_fresh_eye() -> None:
     rows = json.loads((ROOT / "benchmarks" / "results" / "style_eye.json").read_text())["rows"]
-    painted = [row["picture"] for row in rows if row["said"] == "painted"]
-    assert len(rows) == 26
-    assert {name for name in painted if not name.startswith("style-itself")} == {
-        f"{style}-pieces-{photo}" for style in STYLES for photo in ("hopper", "rocket")
-    }
-    assert len(painted) == 14
-    hung = [row["would_hang"] for row in rows if "-pieces-" in row["picture"]]
-    assert (min(hung), max(hung)) == (3, 7)
-    assert sum(row["picture"].startswith(("cv-", "twelve-colours")) for row in rows) == 8
+    pieces = {f"{style}-pieces-{photo}" for style in STYLES for photo in ("hopper", "rocket")}
+    themselves = {"style-itself-strokes", "style-itself-watercolour"}
+    for eye in (1, 2):
+        own = {row["picture"]: row for row in rows if row["eye"] == eye}
+        assert len(own) == 26
+        assert {name for name, row in own.items() if row["said"] == "painted"} == pieces | themselves
+        assert sum(name.startswith(("cv-", "twelve-colours")) for name in own) == 8
+
+    def ends(names: set[str], what: str) -> tuple[int, int]:
+        found = [row[what] for row in rows if row["picture"] in names]
+        return min(found), max(found)
+
+    assert (ends(pieces, "confidence"), ends(themselves, "confidence")) == ((60, 82), (88, 93))
+    assert (ends(pieces, "would_hang"), ends(themselves, "would_hang")) == ((4, 7), (6, 8))
 
 
 def test_what_docs_say_of_films() -> None:
