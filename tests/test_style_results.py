@@ -186,7 +186,7 @@ def test_what_docs_say_of_films() -> None:
     assert {row["style"] for row in FILM} == set(STYLES)
     apart = [row[name] for row in FILM for name in ("by_themselves", "same_seed")]
     assert f"{min(apart):.2f} to {max(apart):.2f} RMS" in TEXT
-    assert all(0.02 < row["film"] < 0.04 for row in FILM)
+    assert all(0.015 < row["film"] < 0.05 for row in FILM)
     assert all(0.028 < row["frames"] < 0.03 for row in FILM)
     assert all(abs(row["detail"]["film"] - row["detail"]["by_themselves"]) < 0.015 for row in FILM)
 

@@ -200,8 +200,8 @@ def texture_transfer(
                glaze: share of t + m, as far as the pieces do not show it, that is laid over them, by strokes, >= 0.
                palette: share of the way to the exemplar's colours, 0..1.
                turns: of the exemplar, evenly spread over a whole one; 1 leaves its strokes as they lie.
-               steps: down on the loss (`style.StyleLoss`), two thirds of the time; none where the picture or the exemplar
-               has a side of less than 64 pixels.
+               steps: down on the loss (`style.StyleLoss`), two thirds of the time; none where the picture or the
+               exemplar has a side of less than 64 pixels.
                motion: the pictures are frames of a film, and what they show moves by so many pixels (x, y) from each
                to the next: (2,), (B-1,2), or (B-1,2,H,W) of each pixel of the later one. Strokes move with it. One that
                points out of the picture says that a pixel was not in view.
