@@ -21,6 +21,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -280,6 +281,11 @@ def folder_of(style: str, name: str, work: Path, *, seed: int = 0) -> Path:
     return work / (f"{style}-{name}".replace(", ", "-").replace(" ", "-") + again)
 
 
+def shot_of(style: str, name: str, photograph: str, work: Path) -> Tensor:
+    """As an arm took it."""
+    return read_picture(folder_of(style, name, work) / f"{photograph}.png")
+
+
 def collect(work: Path) -> None:
     """Runs in the work folder to the committed results and pictures; what was not run again stays as it is."""
     own = [json.loads(path.read_text()) for path in sorted(work.glob("*/result.json"))]
@@ -295,9 +301,7 @@ def collect(work: Path) -> None:
     rows.sort(key=lambda row: (list(STYLES).index(row["style"]), order[row["arm"]], row["seed"]))
     write_json(RESULT, {"environment": environment(), "rows": rows})
 
-    def shot(style: str, name: str, photograph: str) -> Tensor:
-        return read_picture(folder_of(style, name, work) / f"{photograph}.png")
-
+    shot = partial(shot_of, work=work)
     photographs = measures.photographs(SIZE)
     ordinary = shots(style_camera(stage=False))
     hopper = next(iter(photographs))

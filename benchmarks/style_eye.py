@@ -18,6 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from benchmarks import style, style_measures
+from kcam.plots import as_image
 from kcam.style import STYLES
 
 SHOWN = 768  # pixels of a side
@@ -25,7 +26,7 @@ SHOWN = 768  # pixels of a side
 
 def levels(picture: Tensor) -> np.ndarray:
     """(3,H,W) as OpenCV has it."""
-    return (picture.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+    return (as_image(picture)[..., ::-1] * 255).round().astype(np.uint8)
 
 
 def filtered(photo: np.ndarray) -> dict[str, np.ndarray]:
@@ -39,17 +40,21 @@ def filtered(photo: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def pictures(work: Path) -> dict[str, np.ndarray]:
+def pictures() -> dict[str, np.ndarray]:
     """By name, the shots from where the benchmark has put them."""
+
+    def shot(own: str, arm: str, name: str) -> np.ndarray:
+        return levels(style.shot_of(own, arm, name, style.WORK))
+
     found = {}
     for name, photo in style_measures.photographs(style.SIZE).items():
         if name in ("hopper", "rocket"):
             found |= {f"{kind}-{name}": made for kind, made in filtered(levels(photo)).items()}
-            found |= {f"{own}-pieces-{name}": cv2.imread(str(work / f"{own}-pieces" / f"{name}.png")) for own in STYLES}
+            found |= {f"{own}-pieces-{name}": shot(own, "pieces", name) for own in STYLES}
     for own in ("strokes", "watercolour"):
         found[f"style-itself-{own}"] = levels(style.halves(own)[0][:, : style.SIZE])
-        found[f"{own}-camera-hopper"] = cv2.imread(str(work / f"{own}-convolution" / "hopper.png"))
-        found[f"{own}-network-hopper"] = cv2.imread(str(work / f"{own}-stage" / "hopper.png"))
+        found[f"{own}-camera-hopper"] = shot(own, "convolution", "hopper")
+        found[f"{own}-network-hopper"] = shot(own, "stage", "hopper")
     return found
 
 
@@ -57,7 +62,7 @@ def main() -> None:
     """Write them."""
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True)
-    found = pictures(style.WORK)
+    found = pictures()
     names = sorted(found)
     random.Random().shuffle(names)
     for index, name in enumerate(names):

@@ -134,12 +134,13 @@ def picture(*shape: int) -> Tensor:
     return nn.functional.interpolate(coarse, shape[-2:], mode="bicubic").clamp(0, 1)
 
 
-ELSEWHERE = {"texture transfer": math.inf, "style stage": 1e-3, "JPEG": 0.01}
+ELSEWHERE = {"pieces": math.inf, "texture transfer": math.inf, "style stage": 1e-3, "JPEG": 0.01}
 """Other rounding may choose another piece, or step; a network's convolutions are as torch has them, in TF32."""
 PRETENDED = {"texture transfer": 0.01}
 """Kornia's boxes are rounded otherwise where it knows no CPU, and the steps go by the signs of slopes."""
 STAGES: dict[str, Callable[[], nn.Module]] = {
     "style stage": lambda: painting_stage().mean(),
+    "pieces": lambda: isp.TextureTransfer(style.painting("strokes", size=64), seed=0, steps=0),
     "texture transfer": lambda: isp.TextureTransfer(style.painting("strokes", size=64), seed=0, steps=2),
     "learned demosaic": lambda: nn.Sequential(sensor.Mosaic("RGGB"), isp.LearnedDemosaic()),
     "malvar": lambda: nn.Sequential(sensor.Mosaic("RGGB"), isp.Demosaic("malvar", pattern="RGGB")),

@@ -129,13 +129,13 @@ def test_what_docs_say_of_pieces() -> None:
     assert met["patch_swd"] == set(STYLES) - {"woodcut"}
     assert met["detail_correlation"] == set(STYLES) - {"pointillism", "hatching"}
     dots = [row["mean"]["detail_correlation"] for row in rows if row["style"] == "pointillism"]
-    assert sum(value < 0.75 for value in dots) == 1  # "by one of three seeds"
+    assert sum(value < PIECES["detail_correlation"] for value in dots) == 1  # "by one of three seeds"
 
     def missing_of(style: str, name: str) -> float:
         return PIECES[name] - committed(style, "pieces")["mean"][name]
 
     assert f"misses the second, by {100 * missing_of('woodcut', 'patch_swd'):.0f} %" in TEXT
-    assert f"pointillism but for {0.75 - min(dots):.3f} of detail" in TEXT
+    assert f"pointillism but for {PIECES['detail_correlation'] - min(dots):.3f} of detail" in TEXT
     assert f"hatching the third, by {missing_of('hatching', 'detail_correlation'):.2f}" in TEXT
 
 

@@ -132,36 +132,37 @@ class _Laid:
         not be known.
         """
         book = self.book
-        other = places != picked(self.places, sites)[:, None]
+        own = picked(self.places, sites)
+        other = places != own[:, None]
         some = other.any(1).nonzero()[:, 0]
         if not len(some):
             return
-        sites, places, other = (picked(given, some) for given in (sites, places, other))
+        sites, places, other, own = (picked(given, some) for given in (sites, places, other, own))
         beside, inside = self._beside(sites)
-        goes_on, there = picked(self.places, beside) - self.steps, picked(self.shown, beside)
-        theirs = book.shows(goes_on)
+        goes_on = picked(self.places, beside) - self.steps
+        around = (goes_on, book.shows(goes_on), picked(self.shown, beside), inside)
 
-        def seams(places: Tensor, at: Tensor) -> Tensor:
-            """What they cost on all sides of such pixels of those above, (N,)."""
-            cost = (picked(book.shown, places)[:, None] - picked(theirs, at)).square().sum(2)
-            cost += (book.shows(places[:, None] + self.steps) - picked(there, at)).square().sum(2)
-            cost += self.joint * (places[:, None] != picked(goes_on, at))
-            return self.seam * (cost * picked(inside, at)).sum(1)
+        def seams(places: Tensor, goes_on: Tensor, theirs: Tensor, there: Tensor, inside: Tensor) -> Tensor:
+            """What they cost beside what is around each, (N,)."""
+            cost = (picked(book.shown, places)[:, None] - theirs).square().sum(2)
+            cost += (book.shows(places[:, None] + self.steps) - there).square().sum(2)
+            cost += self.joint * (places[:, None] != goes_on)
+            return self.seam * (cost * inside).sum(1)
 
-        now = seams(picked(self.places, sites), torch.arange(len(sites), device=sites.device))
+        now = seams(own, *around)
         pairs = other.flatten().nonzero()[:, 0]
         at, found = pairs // places.shape[1], picked(places.flatten(), pairs)
         here = picked(sites, at)
         apart = picked(book.compared, found) - picked(self.asked, here)
         misfit = (picked(self.weights, here) * apart.square()).sum(1)
         if self.kept is not None:
-            own = picked(self.kept, here)
-            misfit = misfit + self.keep * ((found != own) & (own >= 0))
+            kept = picked(self.kept, here)
+            misfit = misfit + self.keep * ((found != kept) & (kept >= 0))
         worse = misfit - picked(self.misfit, here) - picked(now, at)
         able = (worse < 0).nonzero()[:, 0]
         pairs, at, found, misfit, worse = (picked(given, able) for given in (pairs, at, found, misfit, worse))
         gains, misfits = misfit.new_zeros(2, *places.shape)
-        gains.view(-1)[pairs] = worse + seams(found, at)
+        gains.view(-1)[pairs] = worse + seams(found, *(picked(given, at) for given in around))
         misfits.view(-1)[pairs] = misfit
         gain, best = gains.min(1)
         taken = (gain < 0).nonzero()[:, 0]

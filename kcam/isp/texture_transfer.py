@@ -47,6 +47,8 @@ FINISH: dict[str, Any] = {"colour": 1.0, "content": 0.3, "flat": 1e-2, "sparse":
 RATE = 0.0075
 PAINTS, ALIKE = 512, 0.04
 """Pixels of the exemplar whose colours are its paints, and deviation of colours that count as the same."""
+BASIS = (LUMINANCE, *OPPONENT[1:])
+"""In which colours are brought to others': what is bright, and two of what is not seen of it."""
 KEEP = 1.0
 """What it costs in a film that a pixel leaves the piece that it was of."""
 AT_ONCE, SHARED = 1024, 64
@@ -99,10 +101,13 @@ def _transferred(
         painted = torch.lerp(painted, _with_colours_of(painted, exemplar.picture), palette)
     painted = clip_ste(painted, 0.0, 1.0)[:, :height, :width]
     if loss is not None:
-        moved = _finished(painted, picture, loss, steps)
-        if palette:
-            moved = torch.lerp(moved, _with_colours_of(_by_paints(moved, exemplar.picture), exemplar.picture), palette)
-        painted = painted + (moved.clamp(0, 1) - painted).detach()
+        with torch.no_grad():
+            better = _finished(painted, picture, loss, steps)
+            if palette:
+                mixed = _by_paints(better, exemplar.picture)
+                better = torch.lerp(better, _with_colours_of(mixed, exemplar.picture), palette)
+            change = better.clamp(0, 1) - painted
+        painted = painted + change
     return painted, (places, chance)
 
 
@@ -138,7 +143,7 @@ def _parts(length: int) -> list[tuple[slice, Tensor]]:
 
 def _with_colours_of(picture: Tensor, other: Tensor) -> Tensor:
     """With the mean and covariance of another one's colours; what is brighter stays brighter."""
-    basis = picture.new_tensor((LUMINANCE, *OPPONENT[1:]))
+    basis = picture.new_tensor(BASIS)
     own, theirs = (basis @ one.flatten(1) for one in (picture, other))
     aim = torch.cov(theirs, correction=0)
     steady = STEADY * aim + 1e-5 * torch.eye(3).to(aim)
@@ -148,12 +153,11 @@ def _with_colours_of(picture: Tensor, other: Tensor) -> Tensor:
     return (moved + other.flatten(1).mean(1, keepdim=True)).view_as(picture)
 
 
-@torch.no_grad()
 def _by_paints(picture: Tensor, exemplar: Tensor) -> Tensor:
     """As bright as it is, in what the exemplar has of such colours: a loss also tints what no paint would."""
     flat = exemplar.flatten(1)
     some = torch.randperm(flat.shape[1], generator=torch.Generator().manual_seed(0))[:PAINTS]
-    paints, basis = flat[:, some.to(flat.device)].T, flat.new_tensor((LUMINANCE, *OPPONENT[1:]))
+    paints, basis = flat[:, some.to(flat.device)].T, flat.new_tensor(BASIS)
     parts = []
     for part in picture.flatten(1).T.split(2**14):  # 34 MB at once
         mixed = torch.softmax(torch.cdist(part, paints).square() / (-2 * ALIKE**2), dim=1) @ paints
