@@ -38,9 +38,6 @@ URGENT = 10.0
 EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
 """Models. What other choices cost is the same in both, to 10 % (of 24 maps of pixels, f/5 to f/50)."""
 
-LITTLE = 0.6
-"""Of the time of a picture by one model that it takes by the other: then what is known of that one is not needed."""
-
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
@@ -177,17 +174,15 @@ class Ladder:
         return f"{self.levels[below[0]].label} would cost {self.errors[below]:.2g}"
 
 
-def ladders(
-    evaluator: Evaluator, scene: Scene, *, seconds: Callable[[dict[str, Any]], float], one: bool = False
-) -> list[Ladder]:
+def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:
     """The choices that exist for a camera and a scene (the one that takes longest), of which the evaluator has then
-    seen what it needs; seconds: predicted for changes of the Imaging; one: those that pay for a single picture.
+    seen what it needs; one: those that pay for a single picture.
     """
     imaging = evaluator.imaging
     if imaging is None:
         evaluator.look({})
         return []
-    view = _View(evaluator, imaging, scene, seconds=seconds, one=one)
+    view = _View(evaluator, imaging, scene, one=one)
     evaluator.look(view.beside)
     return [ladder for make in LADDERS for ladder in make(view)]
 
@@ -195,15 +190,7 @@ def ladders(
 class _View:
     """What the ladders look at."""
 
-    def __init__(
-        self,
-        evaluator: Evaluator,
-        imaging: Imaging,
-        scene: Scene,
-        *,
-        seconds: Callable[[dict[str, Any]], float],
-        one: bool,
-    ) -> None:
+    def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene, *, one: bool) -> None:
         self.imaging, self.scene, self.one = imaging, scene, one
         planes = imaging.working(scene)
         self.vergences, _ = imaging.layers_of(scene, planes)
@@ -227,8 +214,7 @@ class _View:
         self.computed = isinstance(lens, Lens) or imaging.varies  # else PSFs cost next to nothing
         self.stand_in: dict[str, Any] = {}
         if self.row is not None and self.row.physics == EXACT and isinstance(lens, Lens) and lens.has_pixels:
-            gain = seconds(PARAXIAL) / max(seconds({}), 1e-30)
-            self.stand_in = PARAXIAL if gain < (LITTLE if one else 1.0) else {}
+            self.stand_in = PARAXIAL  # no warp, and lines
         self.beside = self.few()
 
     def places(self, apart: float) -> tuple[int, int]:

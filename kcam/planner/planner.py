@@ -24,10 +24,8 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.noise import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH, ROUND = 1.6, 0.8
-"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and through a
-round lens without rings, whose PSFs cost least to foretell: measured.
-"""
+WORTH = 0.8
+"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves: measured."""
 
 SENSOR = "sensor"
 """The tolerance that follows from what a sensor records."""
@@ -132,9 +130,7 @@ class Planner:
         imaging = self.evaluator.imaging
         if imaging is None or self.evaluator.varies:
             return False
-        lens: Any = imaging.lens
-        smooth = getattr(lens, "symmetric", False) and not lens.has_rings
-        return self.prices.of({})[0] > (ROUND if smooth else WORTH)
+        return self.prices.of({})[0] > WORTH
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:
@@ -218,7 +214,7 @@ class Planner:
         """All choices."""
         if self._known is None:
             prices = self.prices
-            every = ladders(self.evaluator, prices.scene, seconds=lambda changes: prices.of(changes)[0], one=self.one)
+            every = ladders(self.evaluator, prices.scene, one=self.one)
             steps = [ladder for ladder in every if not ladder.doubtful or self.prices.saves(ladder)]
             skips = [_Skip(self.camera, index, self.evaluator.signals) for index in self.evaluator.skippable()]
             self._known = steps, skips

@@ -37,6 +37,9 @@ from kcam.sensor.noise import Mean
 LINEAR = {"blur", "bands", "psf_shape", "renormalise", "kappa", "propagator", "layers", "occlusion"}
 """Changes of an Imaging that act as transfer functions do, and that of what hides what."""
 
+WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
+"""Of these, those whose error is that of the PSFs themselves, not of what they are computed for."""
+
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 """Sides of the windows of PSFs that may stand for the whole [pixels]."""
 
@@ -95,7 +98,7 @@ class Spectra:
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
-        self._tables: dict[Any, _Table] = {} if imaging.known is None else dict(imaging.known.others)
+        self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
     def of(
@@ -135,7 +138,8 @@ class Spectra:
         """Whether transfer functions of all wavelengths are known at once."""
         imaging = self.imaging.changed(**settings)
         vergences = [self._of(index, settings.get("layers")).vergences for index in range(len(self.groups))]
-        return all(self._table(imaging, own, self._few) is not None for own in vergences)
+        known = ((self._table(imaging, own, self._few), self._lines(imaging, own, self._few)) for own in vergences)
+        return all(table is not None or lines is not None for table, lines in known)
 
     @functools.cached_property
     def _few(self) -> Tensor:
@@ -169,10 +173,11 @@ class Spectra:
 
     def _linear(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
+        exactly = any(changes.get(name) != against.get(name) for name in WITH_PSFS)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
-            theirs, ours = (self._once(index, layered, own, against) for own in (against, changes))
+            theirs, ours = (self._once(index, layered, own, against, exactly=exactly) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
             found[0, rows] *= (_HIDDEN if len(layered.vergences) > 1 and self._hides else 1.0) ** 2
         return found[0] * (1.0 if self.fits else _CUT) ** 2, found[1]
@@ -180,8 +185,8 @@ class Spectra:
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
         at_once = mixed.permute(2, 3, 0, 1)  # (2, F, R, K Z)
-        through = at_once @ layered.crossed.to(mixed.dtype)
-        return (through * at_once.conj()).real.sum((1, 2, 3, 4)).clamp(min=0)
+        parts = torch.cat([at_once.real, at_once.imag], dim=2) if mixed.is_complex() else at_once
+        return ((parts @ layered.crossed) * parts).sum((1, 2, 3, 4)).clamp(min=0)
 
     def _of(self, index: int, layers: Any) -> _Layered:
         key = index, str(layers)
@@ -196,13 +201,15 @@ class Spectra:
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
 
-    def _once(self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any]) -> Tensor:
-        key = index, str(against.get("layers")), *sorted(changes.items())
+    def _once(
+        self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], *, exactly: bool
+    ) -> Tensor:
+        key = index, exactly, str(against.get("layers")), *sorted(changes.items())
         if key not in self._known:
             between = None
             if changes.get("layers") != against.get("layers"):
                 between = self._between(self.groups[index][1], layered.vergences, self.imaging.changed(**changes))
-            self._known[key] = self._mixed(layered, changes, between)
+            self._known[key] = self._mixed(layered, changes, between, exactly=exactly)
         return self._known[key]
 
     def _between(self, scene: Scene, vergences: Tensor, imaging: Imaging) -> tuple[Tensor, Tensor]:
@@ -214,7 +221,14 @@ class Spectra:
         present = shares.amax(1) > 0
         return own[present], shares[present].T
 
-    def _mixed(self, layered: _Layered, changes: Mapping[str, Any], between: tuple[Tensor, Tensor] | None) -> Tensor:
+    def _mixed(
+        self,
+        layered: _Layered,
+        changes: Mapping[str, Any],
+        between: tuple[Tensor, Tensor] | None,
+        *,
+        exactly: bool,
+    ) -> Tensor:
         """Of each sum of bands for each plane in each layer, (R, K Z, 2, F).
 
         between: what `_between` says of the layers of these changes, if they are others.
@@ -222,7 +236,7 @@ class Spectra:
         imaging, scene = self.imaging.changed(**changes), self.scene
         groups = imaging.psf_wavelengths(scene.wavelengths)
         vergences = layered.vergences if between is None else between[0]
-        transfer = self._transfer(imaging, vergences, groups)  # (Z, G, 2, F)
+        transfer = self._transfer(imaging, vergences, groups, exactly=exactly)  # (Z, G, 2, F)
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
@@ -233,12 +247,15 @@ class Spectra:
         mixed = mixed.view(len(mixing), -1, len(transfer), 2, len(self.frequencies))
         return mixed.flatten(1, 2)
 
-    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Tensor:
+    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, exactly: bool) -> Tensor:
         """Slices of transfer functions along x and y, (Z, G, 2, F)."""
         if not imaging.accuracy.blur:
             return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
         window = self._window(imaging, vergences)
-        if (known := self._table(imaging, vergences, wavelengths)) is not None:
+        known = self._table(imaging, vergences, wavelengths)
+        if known is None and not exactly:
+            known = self._lines(imaging, vergences, wavelengths)
+        if known is not None:
             places = [known.wavelengths.index(one) for one in wavelengths.tolist()]
             found = known.transfer(self.frequencies, window, places).cpu()
         else:
@@ -306,6 +323,18 @@ class Spectra:
             self._tables[key] = _Table(some.tolist(), transfer)
             if imaging.known is not None:
                 imaging.known.keep(key, self._tables[key])
+        return self._tables[key]
+
+    def _lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
+        """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
+        window, some = self._window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
+        key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
+        if key not in self._tables:
+            lines = None
+            if (query := self._query(imaging, vergences, some, window)) is not None:
+                row = imaging.accuracy.row(replace(query, wavelengths=self._few))  # the price of all takes as long
+                lines = row.lines(query)
+            self._tables[key] = None if lines is None else _Table(some.tolist(), lines)
         return self._tables[key]
 
 
@@ -383,18 +412,29 @@ def _crossed(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
     """Cross-spectra of planes (K, H, W), mirrored at the borders, or in the dark: (2, F, K, K) of light that runs along
     x, and y.
     """
-    size = [2 * n for n in planes.shape[-2:]]
+    height, width = planes.shape[-2:]
     if dark:
-        found = scipy.fft.rfftn(planes.cpu().numpy(), s=size, axes=(-2, -1), norm="ortho")
+        found = scipy.fft.rfftn(planes.cpu().numpy(), s=(2 * height, 2 * width), axes=(-2, -1), norm="ortho")
         spectrum = torch.view_as_real(torch.as_tensor(found))
-        fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64).abs(), torch.fft.rfftfreq(size[1], dtype=torch.float64)
     else:
         spectrum = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
-        fy, fx = (torch.arange(n // 2, dtype=torch.float64) / n for n in size)
-    radius = torch.hypot(fy[:, None], fx)
-    ring = torch.bucketize(radius.flatten(), (frequencies[1:] + frequencies[:-1]) / 2)
-    label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
-    order = label.argsort(stable=True)
-    counts = label.bincount(minlength=2 * len(frequencies)).tolist()
+    order, counts = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
     parts = spectrum.flatten(1, 2)[:, order].split(counts, dim=1)
     return torch.stack([part.flatten(1) @ part.flatten(1).T for part in parts]).double().unflatten(0, (2, -1))
+
+
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: bool) -> tuple[Tensor, list[int]]:
+    """The order in which a spectrum's frequencies lie in rings, first of light that runs along x, then along y, and how
+    many lie in each.
+    """
+    if dark:
+        fy = torch.fft.fftfreq(2 * height, dtype=torch.float64).abs()
+        fx = torch.fft.rfftfreq(2 * width, dtype=torch.float64)
+    else:
+        fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in (height, width))
+    middles = torch.tensor(frequencies, dtype=torch.float64)
+    ring = torch.bucketize(torch.hypot(fy[:, None], fx).flatten(), (middles[1:] + middles[:-1]) / 2)
+    label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
+    return label.argsort(stable=True), label.bincount(minlength=2 * len(frequencies)).tolist()

@@ -69,7 +69,7 @@ class Cells:
             amplitude = power = torch.ones((), **like).expand(len(edges) - 1, len(edges) - 1)
         phases, factors = [], []
         for pixels, (size, width) in zip(found, maps, strict=True):
-            values = _looked_up(pixels.values.to(**like), edges, size=size, half_width=width)
+            values = looked_up(pixels.values.to(**like), edges, size=size, half_width=width)
             if pixels.factors is None:
                 amplitude, power = amplitude * values, power * values**2
             else:
@@ -158,7 +158,7 @@ def disc_cells(
     return torch.as_tensor(amplitude).to(device, dtype).contiguous(), torch.as_tensor(share).to(device, dtype)
 
 
-def _looked_up(values: Tensor, edges: np.ndarray, *, size: int, half_width: float) -> Tensor:
+def looked_up(values: Tensor, edges: np.ndarray, *, size: int, half_width: float) -> Tensor:
     """A map (n, n) in the cells (C, C); its outermost pixels continue."""
     if size == len(edges) - 1 and half_width == 1:
         return values

@@ -16,10 +16,11 @@ from kcam.optics.propagation.cells import Cells
 from kcam.optics.propagation.curved import Curvature, CurvedTransform, mean_slope
 from kcam.optics.propagation.estimates import ROUNDING, grid_error, paraxial_error, trace
 from kcam.optics.propagation.intensity import pupil_intensity
-from kcam.optics.propagation.question import Query, residual_path
+from kcam.optics.propagation.lines import lines
+from kcam.optics.propagation.question import Query, residual_amplitude, residual_path
 from kcam.optics.propagation.row import FFT_SLOWNESS, PRODUCTS, Propagator
 from kcam.optics.propagation.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Transform
-from kcam.optics.pupil.coordinates import EDGE_MARGIN, Pupil, from_image_side, grid_nodes, grid_spacing
+from kcam.optics.pupil.coordinates import EDGE_MARGIN, from_image_side, grid_nodes, grid_spacing
 from kcam.optics.pupil.quadrants import unfold
 from kcam.optics.pupil.rim import round_weights
 from kcam.optics.pupil.warp import Warp
@@ -136,7 +137,7 @@ def _grid_group(query: Query, members: list[int], *, count: int, per_pixel: floa
     x, y = along[None, :], along[:, None]
     pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
     coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
-    amplitude = _amplitude(query, pupil, curved=curved)
+    amplitude = residual_amplitude(query, pupil, curved=curved)
     cell_area = (semi_aperture * spacing) ** 2
     cells = Cells.of(query, wavelengths, count=count, spacing=spacing)
     if cells is None:
@@ -202,16 +203,6 @@ def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
         if count <= length:
             return count, length, spacing
         length = fast_length(count)  # a longer transform has finer samples, and so more of them
-
-
-def _amplitude(query: Query, pupil: Pupil, *, curved: bool) -> Tensor:
-    """Obliquity and source amplitude on the pupil's points, (1 or Z, ...)."""
-    if query.paraxial:
-        return torch.ones_like(pupil.rho2)[None]
-    # a spherical wave's amplitude falls as 1 / R over the pupil: 1 / sqrt(1 + V^2 r^2)
-    falloff = torch.rsqrt(1 + query.vergences[:, None, None] ** 2 * pupil.rho2 * query.semi_aperture**2)
-    # the Debye map's amplitude is `measure` in the image-side plane; d^2 u' / d^2 u is measure^-2
-    return falloff * (1 / pupil.measure if curved else pupil.measure)
 
 
 def _disc_weights(query: Query, *, count: int, spacing: float) -> Tensor:
@@ -340,6 +331,7 @@ def _row(
         rate=PRODUCTS,
         valid=valid,
         on_grid=method != "fft",
+        lines=lines,
         about=about,
     )
 

@@ -278,6 +278,16 @@ def residual_path(query: Query, pupil: Pupil, elements: Sequence[Element] | None
     return torch.stack(coefficients, dim=-1), _stacked(maps)
 
 
+def residual_amplitude(query: Query, pupil: Pupil, *, curved: bool = False) -> Tensor:
+    """Obliquity and source amplitude on the pupil's points, (1 or Z, ...); curved: in the true plane."""
+    if query.paraxial:
+        return torch.ones_like(pupil.rho2)[None]
+    # a spherical wave's amplitude falls as 1 / R over the pupil: 1 / sqrt(1 + V^2 r^2)
+    falloff = torch.rsqrt(1 + query.vergences[:, None, None] ** 2 * pupil.rho2 * query.semi_aperture**2)
+    # the Debye map's amplitude is `measure` in the image-side plane; d^2 u' / d^2 u is measure^-2
+    return falloff * (1 / pupil.measure if curved else pupil.measure)
+
+
 def _stacked(maps: Sequence[Tensor]) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*maps))
 

@@ -28,7 +28,7 @@ FFT_SLOWNESS = 10.0  # operations of a matrix product in the time of one of an F
 Transfer = Callable[[Tensor, tuple[int, int], Sequence[int]], Tensor]
 """From frequencies (F,) along an axis of the pixels [cycles per pixel], a window (h, w) that is not larger than the
 query's, and indices of L of its wavelengths, to slices of the transfer functions along x and y of what falls into that
-window: (Z, L, 2, F).
+window: (Z, L, 2, F), real or complex.
 """
 
 
@@ -45,6 +45,8 @@ class Propagator(nn.Module):
         exact: whether only sampling separates the row from its physics, so that it may be chosen by cost alone.
         on_grid: whether it samples the pupil on a Cartesian grid, of so many samples as `Query.samples` says.
         transfer: query -> `Transfer`, where transfer functions are known without the PSFs.
+        lines: query -> `Transfer` for the window of the query alone, or None, for estimates: right enough to tell what
+            other wavelengths and distances change, see `LineTransfer`.
         about: what it does, in a line of the documentation.
     Raises: ValueError for a rate that is not > 0.
     """
@@ -63,13 +65,14 @@ class Propagator(nn.Module):
         exact: bool = True,
         on_grid: bool = False,
         transfer: Callable[[Query], Transfer] | None = None,
+        lines: Callable[[Query], Transfer | None] | None = None,
         about: str = "",
     ) -> None:
         super().__init__()
         self.physics, self.method, self.paraxial, self.exact = physics, method, paraxial, exact
         self.function, self.error_of, self.cost_of, self.reason_of = function, error, cost, valid
         self.kind, self.rate = rate if isinstance(rate, Rate) else (f"{physics}/{method}", float(rate))
-        self.on_grid, self.transfer_of, self.about = on_grid, transfer, about
+        self.on_grid, self.transfer_of, self.lines_of, self.about = on_grid, transfer, lines, about
         if not self.rate > 0:
             raise ValueError(f"rate must be > 0 seconds for an operation of {physics}/{method}, got {self.rate:g}.")
 
@@ -95,6 +98,12 @@ class Propagator(nn.Module):
         if self.transfer_of is None or self.valid_for(query) is not None:
             return None
         return self.transfer_of(query.modelled(paraxial=self.paraxial))
+
+    def lines(self, query: Query) -> Transfer | None:
+        """About the transfer functions of a query, in a fraction of the time of its PSFs, or None."""
+        if self.lines_of is None or self.valid_for(query) is not None:
+            return None
+        return self.lines_of(query.modelled(paraxial=self.paraxial))
 
     def valid_for(self, query: Query) -> str | None:
         """Why the row cannot answer a query, or None."""
