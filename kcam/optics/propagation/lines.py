@@ -174,7 +174,8 @@ class _Maps:
         """What passes of the power in the rows along x, or the columns along y, (R, N)."""
         places = (torch.bucketize(x.contiguous(), self.edges) - 1 for x in (rows, nodes))
         row, node = (place.clamp(0, len(self.amplitude) - 1) for place in places)
-        return (self.amplitude.T if axis else self.amplitude).square()[row][:, node]
+        passed = (self.amplitude.T if axis else self.amplitude).square()[row][:, node]
+        return passed * (nodes.abs() <= 1)  # beyond the maps there is no light
 
 
 @dataclass(frozen=True)
