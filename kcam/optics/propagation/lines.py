@@ -23,6 +23,7 @@ from kcam.optics.propagation.question import Query, residual_amplitude, residual
 from kcam.optics.pupil.coordinates import Pupil, from_image_side, grid_nodes, grid_spacing
 from kcam.optics.pupil.maps import pixel_weights
 from kcam.optics.pupil.rim import edge_profile
+from kcam.precision import full_precision
 
 _KAPPA = 1.7  # samples along a row for each fringe that reaches the window
 _ROWS = 48  # of a smooth pupil at least, and one for so many samples along it
@@ -74,7 +75,7 @@ class LineTransfer:
         query = self.query
         if tuple(shape) != tuple(query.shape):
             raise ValueError(f"line spreads are of the window {query.shape} that was asked for, not of {shape}.")
-        with torch.no_grad():
+        with torch.no_grad(), full_precision(query.device):
             for index in bands:
                 if index not in self.spreads:
                     self.spreads[index] = self._spread(index)
