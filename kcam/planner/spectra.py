@@ -138,8 +138,8 @@ class Spectra:
         """Whether transfer functions of all wavelengths are known at once."""
         imaging = self.imaging.changed(**settings)
         vergences = [self._of(index, settings.get("layers")).vergences for index in range(len(self.groups))]
-        known = ((self._table(imaging, own, self._few), self._lines(imaging, own, self._few)) for own in vergences)
-        return all(table is not None or lines is not None for table, lines in known)
+        ways = (self._table, self._lines)
+        return all(any(way(imaging, own, self._few) is not None for way in ways) for own in vergences)
 
     @functools.cached_property
     def _few(self) -> Tensor:
