@@ -591,6 +591,59 @@ def test_files_that_cannot_be_read_are_refused(tmp_path: Path, monkeypatch: pyte
         Raw.from_file(tmp_path / "shot.dng")
 
 
+def refused_by_name(path: Path) -> bool:
+    """Whether a file is refused; that by another error than one that names it is raised."""
+    try:
+        Raw.from_file(path)
+    except ValueError as error:
+        if path.name in str(error):
+            return True
+        raise
+    return False
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".dng"])
+@pytest.mark.parametrize("seed", range(3))
+def test_damaged_tags_are_an_error_that_names_the_file(seed: int, suffix: str, tmp_path: Path) -> None:
+    """Numbers written over in what stands beside the pixels: read, or refused by name."""
+    if suffix == ".dng":
+        pytest.importorskip("rawpy")
+    generator = np.random.default_rng(seed)
+    whole, path = tmp_path / f"whole{suffix}", tmp_path / f"torn{suffix}"
+    taken(seed)[2].write(whole)
+    with tifffile.TiffFile(whole) as file:
+        own = [tag for tag in file.pages.first.tags if tag.code >= 33421]
+        entries = [at for tag in own for at in range(tag.offset + 2, tag.offset + 12)]
+        values = [at for tag in own for at in range(tag.valueoffset, tag.valueoffset + tag.valuebytecount)]
+    content, refused = whole.read_bytes(), 0
+    for _ in range(60):
+        torn = bytearray(content)
+        for at in generator.choice(entries + values, size=generator.integers(1, 6)):
+            torn[at] = generator.choice([0, 1, 2, 255])
+        path.write_bytes(torn)
+        refused += refused_by_name(path)
+    assert refused
+
+
+@pytest.mark.parametrize(
+    ("code", "dtype", "count", "value"),
+    [(50714, "2I", 1, (64, 0)), (50713, "H", 2, (3, 3)), (33421, "H", 2, (4, 4)), (51041, "d", 1, (1e-4,))],
+    ids=["a black level over nothing", "black levels of no tile", "a mosaic of no tile", "half a noise profile"],
+)
+def test_tags_that_do_not_fit_each_other(code: int, dtype: str, count: int, value: Any, tmp_path: Path) -> None:
+    tags = {
+        33421: (33421, "H", 2, (2, 2), True),
+        33422: (33422, "B", 4, bytes((0, 1, 1, 2)), True),
+        50714: (50714, "H", 1, 64, True),
+        50717: (50717, "I", 1, 1023, True),
+    }
+    tags[code] = (code, dtype, count, value, True)
+    path = tmp_path / "odd.tif"
+    tifffile.imwrite(path, np.full((8, 8), 100, np.uint16), photometric="minisblack", extratags=[*tags.values()])
+    with pytest.raises(ValueError, match=r"odd\.tif"):
+        Raw.from_file(path)
+
+
 def test_libraw_s_refusals_name_the_file(tmp_path: Path) -> None:
     pytest.importorskip("rawpy")
     camera = camera_of()
