@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kcam.optics import CompoundLens
-from kcam.optics.compound.analysis import SPECTRAL_LINES, FieldCurves, rms_radius
+from kcam.optics.compound.analysis import SPECTRAL_LINES, FieldCurves
+from kcam.optics.compound.spots import rms_radius
 from kcam.optics.numerics import Scalar, float64
 from kcam.plots.pictures import light_colours
 from kcam.plots.psf import CURVE_COLOURS

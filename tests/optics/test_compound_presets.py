@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from kcam import optics
+from kcam.optics.compound import aiming
 from kcam.optics.compound.presets import PRESETS
 from kcam.optics.compound.tracing import trace
 from kcam.units import mm, nm, um
@@ -64,14 +65,12 @@ def test_first_order_is_what_the_source_states(name: str) -> None:
 def test_spots_are_as_small_as_those_of_a_right_prescription(name: str, place: int) -> None:
     """A wrong digit shows at once: rms radii over what all surfaces let pass."""
     lens, height = at_d(name), (0.0, 0.7)[place] * PRESETS[name].field
-    nodes = lens._nodes(
-        torch.tensor([D_LINE], dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE), torch.tensor([height], dtype=DOUBLE)
-    )
+    line, far, up = (torch.tensor([value], dtype=DOUBLE) for value in (D_LINE, 0.0, height))
+    nodes = aiming.nodes(lens._prescription, line, far, up)
     semi = float(lens.surfaces[lens.stop].semi_diameter)
     side = torch.linspace(-semi, semi, 41, dtype=DOUBLE)
     x, y = (part.flatten() for part in torch.meshgrid(side, side, indexing="xy"))
-    started = lens.launch(nodes.heights, nodes.vergences, x / nodes.across, nodes.aim + y / nodes.along)
-    rays = lens._at_sensor(started, nodes.indices)
+    rays = nodes.beam.at_sensor(x / nodes.across, nodes.aim + y / nodes.along)
     passed = (rays.alive & (torch.stack(rays.clearance) >= 0).all(0))[0, 0, 0]
     spot = torch.stack([rays.x, rays.y])[:, 0, 0, 0, passed]
     assert passed.sum() > 300

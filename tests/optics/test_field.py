@@ -12,6 +12,7 @@ from draws import Draw
 from torch import Tensor, nn
 
 from kcam import Camera, Scene, optics, sensor
+from kcam.optics.compound import aiming
 from kcam.optics.compound.images import QUICK
 from kcam.optics.numerics import fast_length
 from kcam.optics.propagation import sampling
@@ -344,12 +345,9 @@ def test_pupils_between_heights_are_those_of_their_rays(name: str) -> None:
     psfs = lens.over_field(float(reach), where, colours)
     heights = torch.tensor([draw.number(0, highest) for _ in range(5)], dtype=DOUBLE)
     pupils = psfs.table.at(heights, where.expand(5), colours[3].expand(5))
-    nodes = lens._nodes(colours[3:4], where, heights)
+    nodes = aiming.nodes(lens._prescription, colours[3:4], where, heights)
     radius, angle = 1.1 * draw.noise(2000).sqrt(), math.pi * draw.noise(2000)
-    rays = lens._at_sensor(
-        lens.launch(nodes.heights, nodes.vergences, *nodes.towards(radius * angle.sin(), radius * angle.cos())),
-        nodes.indices,
-    )
+    rays = nodes.beam.at_sensor(*nodes.towards(radius * angle.sin(), radius * angle.cos()))
     chief, least = nodes.chief, torch.stack(rays.clearance).amin(0)
     path = rays.path - rays.dx * rays.x - rays.dy * (rays.y - chief.y) - chief.path
     dx, dy, path, least, alive = (part.flatten(0, 2) for part in (rays.dx, rays.dy, path, least, rays.alive))
@@ -371,11 +369,9 @@ def test_rays_fill_what_is_open_from_anywhere_in_the_field(name: str) -> None:
     """A phone's stop is a steep asphere: seen from the corner its rim is a quarter farther away than by its slopes."""
     lens = optics.CompoundLens.preset(name, focus_distance=3.0)
     heights = torch.tensor([0.3, 0.6, 0.9], dtype=DOUBLE) * lens.field_limit()
-    nodes = lens._nodes(LINES[1:2], torch.tensor([0.3], dtype=DOUBLE), heights)
+    nodes = aiming.nodes(lens._prescription, LINES[1:2], torch.tensor([0.3], dtype=DOUBLE), heights)
     for x, y in ((0.0, 1.12), (0.0, -1.12), (1.12, 0.0)):
-        px, py = nodes.towards(*torch.tensor([[x], [y]], dtype=DOUBLE))
-        rays = lens.launch(nodes.heights, nodes.vergences, px, py)
-        rays = lens._at_sensor(rays, nodes.indices)
+        rays = nodes.beam.at_sensor(*nodes.towards(*torch.tensor([[x], [y]], dtype=DOUBLE)))
         assert bool((~rays.alive | (torch.stack(rays.clearance).amin(0) < 0.02)).all())
     field = torch.stack([0 * heights, heights], 1)
     _, weights = lens.spots([LINES[1]], distances=3.0, field=field, rings=40)

@@ -8,11 +8,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from kcam.optics.compound.aiming import nodes
+from kcam.optics.compound.prescription import Prescription
 from kcam.optics.numerics import chebyshev, chebyshev_points
 
 _SMALL = 1e-11  # of the sum: terms that move light by less are left out
 _NODES = 16
 _MANY = 2**14  # places
+_STEPS = 10  # towards the point whose image lies at the sensor's corner, at most
 
 
 @dataclass(frozen=True)
@@ -58,3 +61,32 @@ class ImageHeights:
 
     over_radius: Even
     scale: Tensor
+
+
+def image_heights(lens: Prescription, reach: float) -> ImageHeights:
+    """How images lie on the sensor, up to `reach` from the axis [m]: see `CompoundLens.image_heights`."""
+    scale = lens.image_scale
+    if reach == 0:
+        return ImageHeights(Even(1 / scale[None], 1.0), scale)
+    grid, focus = lens.focus_line, lens.focus()[None]
+
+    def landed(heights: Tensor) -> Tensor:
+        return -nodes(lens, grid, focus, heights).chief.y[:, 0, 0, 0]
+
+    with torch.no_grad():
+        highest = reach / scale
+        try:
+            for _ in range(_STEPS):
+                before, highest = highest, highest * reach / landed(highest[None])[0]
+                if bool((highest / before - 1).abs() < 1e-4):
+                    break
+            highest = 1.005 * highest
+            landed(highest[None])
+        except ValueError as error:
+            raise ValueError(
+                f"the sensor reaches {reach * 1e3:.3g} mm from the axis, beyond the field of this lens: {error}"
+            ) from error
+    heights = chebyshev_radii(1.0) * highest
+    radii = landed(heights)
+    over_radius = Even.through(heights / radii, radii, reach=float(radii.detach().max()))
+    return ImageHeights(over_radius, scale)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 from kcam.files import check_place, replace
 from kcam.optics.compound import optiland, zemax
-from kcam.optics.compound.layout import Layout
-from kcam.optics.compound.surface import Surface
-from kcam.optics.numerics import Scalar, float64
+from kcam.optics.compound.prescription import Prescription
+from kcam.optics.numerics import float64
 
 _FORMATS = {".zmx": zemax, ".json": optiland}
 SUFFIXES = tuple(_FORMATS)
 
 
-def read_lens(path: str | os.PathLike[str], *, focused: bool) -> Layout:
+def read_lens(path: str | os.PathLike[str], *, focused: bool) -> Prescription:
     """The lens in a file.
 
     Args:      path: its name ends in .zmx or .json.
@@ -38,9 +36,7 @@ def read_lens(path: str | os.PathLike[str], *, focused: bool) -> Layout:
     return found
 
 
-def write_lens(
-    path: str | os.PathLike[str], surfaces: Sequence[Surface], *, sensor_distance: Scalar, focus_wavelength: float
-) -> None:
+def write_lens(path: str | os.PathLike[str], lens: Prescription) -> None:
     """Write a lens so that `path` always holds either the old file or the whole new one.
 
     Raises:    ValueError for another suffix than .zmx and .json, for a name where no file can be, and for asphere terms
@@ -49,7 +45,7 @@ def write_lens(
     path = Path(path)
     module = _FORMATS[_suffix(path)]
     check_place(path)
-    replace(path, module.written(surfaces, sensor_distance, focus_wavelength))
+    replace(path, module.written(lens))
 
 
 def _suffix(path: Path) -> str:

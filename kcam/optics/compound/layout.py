@@ -12,11 +12,11 @@ from typing import Literal, NotRequired, TypedDict
 import torch
 from torch import Tensor
 
+from kcam.optics.compound.prescription import Prescription, indices_at
 from kcam.optics.compound.surface import Surface
 from kcam.optics.compound.tracing import system_matrix
 from kcam.optics.elements.materials import Glass
-from kcam.optics.numerics import Scalar, float64
-from kcam.units import wavelength_grid
+from kcam.optics.numerics import float64
 
 _NUMBER = re.compile(r"[+-]?(\d{1,40}\.?\d{0,40}|\.\d{1,40})([eEdD][+-]?\d{1,3})?")
 DEFAULT_WAVELENGTH = 550e-9
@@ -44,15 +44,6 @@ class Aperture:
 
     kind: Literal["entrance pupil", "stop", "f-number"]
     value: float
-
-
-@dataclass(frozen=True)
-class Layout:
-    """A lens as a file has it: surfaces, from the last vertex to the sensor [m], and the wavelength of focus [m]."""
-
-    surfaces: Sequence[Surface]
-    sensor_distance: Scalar
-    focus_wavelength: float
 
 
 def number(text: str) -> Decimal:
@@ -124,7 +115,7 @@ def build(
     aperture: Aperture | None,
     focus_wavelength: float,
     error: Callable[[str, str], ValueError],
-) -> Layout:
+) -> Prescription:
     """The lens, the last surface's thickness the sensor's distance, and the stop's semi-diameter the smaller one of its
     own and of what fills the aperture.
 
@@ -152,15 +143,14 @@ def build(
         raise error(found[stop].place, "the stop has no semi-diameter, and the file no aperture that gives it one")
     resized = Found(found[stop].arguments | {"semi_diameter": own}, found[stop].place)
     surfaces[stop] = made(resized, stop=True)
-    return Layout(surfaces, distance, focus_wavelength)
+    return Prescription(surfaces, distance, focus_wavelength)
 
 
 def _stop_of(surfaces: Sequence[Surface], stop: int, aperture: Aperture, wavelength: float) -> float:
     """Semi-diameter of a stop that an aperture fills, paraxially [m]."""
     if aperture.kind == "stop":
         return aperture.value / 2
-    grid = wavelength_grid([wavelength])
-    indices = [float64(1.0), *(surface.index(grid)[0] for surface in surfaces)]
+    indices = indices_at(surfaces, wavelength)
     diameter = aperture.value
     if aperture.kind == "f-number":
         power = -float(system_matrix(surfaces, indices)[1, 0])

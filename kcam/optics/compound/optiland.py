@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from decimal import Decimal
 from typing import Any, NoReturn, TypedDict, cast
 
 from kcam.optics.compound import layout
-from kcam.optics.compound.layout import Aperture, Found, Layout, SurfaceArguments
+from kcam.optics.compound.layout import Aperture, Found, SurfaceArguments
+from kcam.optics.compound.prescription import Prescription
 from kcam.optics.compound.surface import Surface
 from kcam.optics.elements.materials import D_F_C, GLASSES, Glass, Sellmeier
 from kcam.optics.numerics import Scalar
@@ -36,7 +36,7 @@ class _Lens(TypedDict):
     wavelengths: _Waves
 
 
-def read(held: bytes, *, name: str) -> Layout:
+def read(held: bytes, *, name: str) -> Prescription:
     """The lens in the bytes of a file. Raises: ValueError that names file and surface for what kcam has not."""
     lens: _Lens = from_json(held, _Lens, wrong=f"{name} is no lens of Optiland's, or damaged", hook=None)
     return _Reader(name).layout(lens)
@@ -80,7 +80,7 @@ class _Reader:
             self.wrong(f"{key!r} is {str(found)[:40]!r}, expected names and values")
         return found
 
-    def layout(self, lens: _Lens) -> Layout:
+    def layout(self, lens: _Lens) -> Prescription:
         found = lens["surface_group"]["surfaces"]
         if len(found) < 3:
             self.wrong(f"it has {len(found)} surfaces, expected an object, a lens and an image")
@@ -264,15 +264,14 @@ def _sellmeier(glass: Sellmeier) -> list[float]:
 # ---- writing -------------------------------------------------------------------------------------------------------
 
 
-def written(surfaces: Sequence[Surface], sensor_distance: Scalar, focus_wavelength: float) -> bytes:
+def written(lens: Prescription) -> bytes:
     """A lens as JSON that Optiland loads, with the same refractive indices."""
-    spaces = [surface.thickness for surface in surfaces[:-1]] + [sensor_distance]
+    spaces = [surface.thickness for surface in lens.surfaces[:-1]] + [lens.sensor_distance]
     millimetres = [layout.decimal(space).scaleb(3) for space in spaces]
-    stop = next(surface for surface in surfaces if surface.stop)
     air = {"type": "IdealMaterial", "index": 1.0, "absorp": 0.0}
     far = {"type": "ObjectSurface", "geometry": _plane(-math.inf), "material_post": air}
     held: list[dict[str, Any]] = [far]
-    for index, (surface, space) in enumerate(zip(surfaces, millimetres, strict=True)):
+    for index, (surface, space) in enumerate(zip(lens.surfaces, millimetres, strict=True)):
         held.append(
             {
                 "type": "Surface",
@@ -287,11 +286,12 @@ def written(surfaces: Sequence[Surface], sensor_distance: Scalar, focus_waveleng
         )
     image = {"type": "Surface", "thickness": 0.0, "geometry": _plane(float(sum(millimetres))), "material_post": air}
     held.append(image | {"is_stop": False, "aperture": None})
-    wave = {"value": float(layout.decimal(focus_wavelength).scaleb(6)), "is_primary": True, "unit": "um", "weight": 1.0}
+    microns = float(layout.decimal(lens.focus_wavelength).scaleb(6))
+    wave = {"value": microns, "is_primary": True, "unit": "um", "weight": 1.0}
     document: dict[str, Any] = {
         "version": 1.0,
         "name": None,
-        "aperture": {"type": "float_by_stop_size", "value": 2 * _mm(cast("Scalar", stop.semi_diameter))},
+        "aperture": {"type": "float_by_stop_size", "value": 2 * _mm(lens.stop_semi_diameter)},
         "fields": {
             "fields": [{"x": 0.0, "y": 0.0, "vx": 0.0, "vy": 0.0, "weight": 1.0}],
             "telecentric": False,

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from kcam.optics.compound.aiming import Asked, nodes
+from kcam.optics.compound.prescription import Prescription
 from kcam.optics.numerics import chebyshev, chebyshev_points
 
 DEGREES = (12, 16, 20)
@@ -30,6 +32,7 @@ _EXTENT = 2.0  # times the standard deviation of what is open: the rim of an ell
 _KNOWN = 1.15  # extents: rays are fitted, and pupils may be open, up to there
 OVERFILL = 1.12  # of the stop's radius, to which rays are sent: seen from off the axis the stop is no ellipse
 _RINGS, _SPOKES = 17, 41
+_AIMING_EACH = 60  # steps at most, of a ray to its point of the stop: a phone's, on a steep stop, takes some 40
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,48 @@ class PupilFit:
         return values[:, 0], torch.cat([values[:, 1:], inside[:, None]], dim=1)
 
 
-def rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+def pupils(lens: Prescription, wavelengths: Tensor, vergences: Tensor, heights: Tensor) -> PupilFit:
+    """Pupils of F x Z x L nodes: see `CompoundLens.pupils`."""
+    found = nodes(lens, wavelengths, vergences, heights)
+    x, y, area = _rays_over_stop(heights.device)
+    rays, chief = found.beam.at_sensor(*found.towards(x, y)), found.chief
+    wavefront = rays.path - rays.dx * rays.x - rays.dy * (rays.y - chief.y) - chief.path
+    clearances = torch.stack([*rays.clearance, rays.margin], dim=-2)  # type: ignore[list-item]
+    flat = [part.flatten(0, 2) for part in (rays.dx, rays.dy, wavefront, clearances, rays.alive, chief.y[..., 0])]
+    return _fit(*flat, area=area, enough=ENOUGH * float(wavelengths.min()))
+
+
+def opd(lens: Prescription, asked: Asked, samples: int) -> tuple[Tensor, Tensor]:
+    """Wavefront over the stop in waves, and where light passes, (F, Z, L, S, S): see `CompoundLens.opd`."""
+    found = nodes(lens, asked.wavelengths, asked.vergences, asked.heights)
+    beam, chief, semi = found.beam, found.chief, lens.stop_semi_diameter
+    side = torch.linspace(-1, 1, samples, dtype=torch.float64)
+    x, y = (part.flatten() for part in torch.meshgrid(side, side, indexing="xy"))
+    # the stop's own axes turn with the field
+    cx, cy = (part[:, None, None, None] for part in asked.directions.unbind(1))
+    to_x, to_y = semi * (x * cy - y * cx), semi * (x * cx + y * cy)
+    with torch.no_grad():
+        px, py = to_x / found.across, found.aim + to_y / found.along
+        for _ in range(_AIMING_EACH):
+            at = beam.at(lens.stop, px, py)
+            off = torch.maximum((at.x - to_x).abs(), (at.y - to_y).abs()).masked_fill(~at.alive, 0.0)
+            if float(off.max()) < 1e-13:
+                break
+            px, py = px - (at.x - to_x) / found.across, py - (at.y - to_y) / found.along
+    rays = beam.at_sensor(px, py)
+    away = lens.sensor_away - beam.first.exit_pupil
+    radius = away.sign() * torch.sqrt(away**2 + chief.y**2)
+    ox, oy = rays.x - chief.x, rays.y - chief.y
+    onto = ox * rays.dx + oy * rays.dy
+    back = onto + radius.sign() * torch.sqrt((onto**2 - ox**2 - oy**2 + radius**2).clamp(min=0))
+    waves = (rays.path - back - chief.path + radius) / asked.wavelengths[:, None]
+    clearances = torch.stack(rays.clearance, dim=-2)
+    passes = rays.alive & (clearances > -1e-9).all(-2) & (x**2 + y**2 <= 1 + 1e-9)
+    waves, passes = (part.expand(waves.shape).unflatten(-1, (samples, samples)) for part in (waves, passes))
+    return waves, passes
+
+
+def _rays_over_stop(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Coordinates x >= 0, y in a disc a little larger than 1, and the area that each stands for, up to a factor, (R,)
     each: rings at Chebyshev radii, all spokes.
     """
@@ -104,7 +148,7 @@ def odd_terms(degree: int) -> Tensor:
     return _orders(degree)[0] % 2 == 1
 
 
-def fit(
+def _fit(
     dx: Tensor,
     dy: Tensor,
     wavefront: Tensor,

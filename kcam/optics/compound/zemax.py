@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import NoReturn, cast
 
 from kcam.optics.compound import layout
-from kcam.optics.compound.layout import Aperture, Found, Layout, SurfaceArguments
+from kcam.optics.compound.layout import Aperture, Found, SurfaceArguments
+from kcam.optics.compound.prescription import Prescription
 from kcam.optics.compound.surface import Surface
 from kcam.optics.elements.materials import GLASSES, Glass
 from kcam.optics.numerics import Scalar
@@ -62,7 +62,7 @@ def text(held: bytes) -> str:
     return found
 
 
-def read(held: bytes, *, name: str) -> Layout:
+def read(held: bytes, *, name: str) -> Prescription:
     """The lens in the bytes of a .zmx file. Raises: ValueError that names file, line and word for what kcam has not."""
     try:
         found = text(held)
@@ -82,7 +82,7 @@ class _Reader:
     def error(self, place: str, reason: str) -> ValueError:
         return layout.refusal(self.name, place, reason)
 
-    def layout(self, found: str) -> Layout:
+    def layout(self, found: str) -> Prescription:
         whole, blocks = self.blocks(found)
         self.whole(whole)
         if len(blocks) < 3:
@@ -313,7 +313,7 @@ class _Reader:
 # ---- writing -------------------------------------------------------------------------------------------------------
 
 
-def written(surfaces: Sequence[Surface], sensor_distance: Scalar, focus_wavelength: float) -> bytes:
+def written(lens: Prescription) -> bytes:
     """A lens as a .zmx file. Raises: ValueError for what the format has no place for."""
     lines = [
         "MODE SEQ",
@@ -322,14 +322,14 @@ def written(surfaces: Sequence[Surface], sensor_distance: Scalar, focus_waveleng
         "FTYP 0 0 1 1 0 0 0",
         "XFLN 0",
         "YFLN 0",
-        f"WAVM 1 {layout.decimal(focus_wavelength).scaleb(6)} 1",
+        f"WAVM 1 {layout.decimal(lens.focus_wavelength).scaleb(6)} 1",
         "PWAV 1",
         *_plane(0, "INFINITY"),
     ]
-    for index, surface in enumerate(surfaces, start=1):
-        thickness = sensor_distance if index == len(surfaces) else surface.thickness
+    for index, surface in enumerate(lens.surfaces, start=1):
+        thickness = lens.sensor_distance if index == len(lens.surfaces) else surface.thickness
         lines += [f"SURF {index}", *(f"  {line}" for line in _surface(surface, thickness, index))]
-    lines += [*_plane(len(surfaces) + 1, "0"), "MNUM 1 1"]
+    lines += [*_plane(len(lens.surfaces) + 1, "0"), "MNUM 1 1"]
     return ("\n".join(lines) + "\n").encode()
 
 
