@@ -6,16 +6,9 @@ import os
 
 from kcam.calibration.chart import ChartPatches, ColourFit, chart_patches, colour_matrix, delta_e
 from kcam.calibration.frames import exposure_time, find, pairs, read_frame, read_times
-from kcam.calibration.photon_transfer import (
-    UNITS,
-    ChannelCalibration,
-    Level,
-    Quantity,
-    SensorCalibration,
-    Spatial,
-    photon_transfer,
-)
+from kcam.calibration.photon_transfer import photon_transfer
 from kcam.calibration.psf import PSFFit, fit_psf
+from kcam.calibration.results import UNITS, ChannelCalibration, Level, Quantity, SensorCalibration, Spatial
 
 
 def save_report(found: SensorCalibration, path: str | os.PathLike[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from kcam import plots
-from kcam.calibration.photon_transfer import MONO, UNITS, ChannelCalibration, SensorCalibration, Spatial
+from kcam.calibration.results import MONO, UNITS, ChannelCalibration, SensorCalibration, Spatial
 from kcam.plots import INK, LABEL, MUTED, SMALL, TITLE, Sheet
 from kcam.report import write_report
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from kcam import Camera, Raw, calibration, sensor
 from kcam.calibration import UNITS, exposure_time, photon_transfer, read_frame
-from kcam.calibration.photon_transfer import root, rounding_variance, unrounded
+from kcam.calibration.rounding import root, rounding_variance, unrounded
 
 
 def found(frames: Frames, **more: Any) -> calibration.SensorCalibration:
