@@ -32,6 +32,7 @@ from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.optics.rendering.zones import Axis
 from kcam.optics.source import Defocus, FieldPSFs, PixelGrid, Points, PSFSource, is_field_source, is_source
+from kcam.optics.wavelengths import few_wavelengths
 from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.threads import no_more_than_free
@@ -348,30 +349,26 @@ class Imaging(Stage):
         changes. The caller's own: it may be changed in place.
         """
         psfs = self._grouped_bank(wavelengths, points=Points(vergences), shape=shape, like=like)
-        owner = self.groups(wavelengths)
-        return psfs.clone() if owner is None else psfs[:, owner.to(psfs.device)]
+        shares = self.shares(wavelengths)
+        return psfs.clone() if shares is None else torch.einsum("lg,zghw->zlhw", shares.to(psfs), psfs)
 
-    def groups(self, wavelengths: Tensor) -> Tensor | None:
-        """Which PSF each band takes, (L,), where several take one; None where each has its own."""
-        count = len(wavelengths)
-        if self.accuracy.blur and (self.accuracy.bands is None or self.accuracy.bands >= count):
-            return None
-        owner = torch.empty(count, dtype=torch.long)
-        parts = (self.accuracy.bands or count) if self.accuracy.blur else 1
-        for index, group in enumerate(wavelengths.argsort().tensor_split(parts)):
-            owner[group] = index
-        return owner
+    def _few(self, wavelengths: Tensor) -> tuple[Tensor, Tensor | None]:
+        count, accuracy = len(wavelengths), self.accuracy
+        if accuracy.blur and (accuracy.bands is None or accuracy.bands >= count):
+            return wavelengths, None
+        few = (accuracy.bands or count) if accuracy.blur else 1
+        return few_wavelengths(wavelengths, few, interpolate=accuracy.interpolate_bands)
 
     def psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
-        """At which the PSFs are computed, (G,) [m]: the bands', or the means of their groups'."""
-        owner = self.groups(wavelengths)
-        if owner is None:
-            return wavelengths
-        sums = wavelengths.new_zeros(int(owner.max()) + 1).index_add_(0, owner, wavelengths)
-        return sums / owner.bincount()
+        """At which the PSFs are computed, (G,) [m]: the bands', or fewer."""
+        return self._few(wavelengths)[0]
+
+    def shares(self, wavelengths: Tensor) -> Tensor | None:
+        """What each of these PSFs gives to each band, (L, G); None where each band has its own."""
+        return self._few(wavelengths)[1]
 
     def _grouped_bank(self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor) -> Tensor:
-        """PSFs of the groups of bands that share one, (Z, G, h, w)."""
+        """PSFs from which the bands take theirs, (Z, G, h, w)."""
         if not self.accuracy.blur:
             return like.new_ones(len(points.vergences), 1, 1, 1)
 
@@ -638,7 +635,7 @@ class Imaging(Stage):
                     torch.eye(count).repeat(1, channels),
                     torch.eye(channels).repeat_interleave(count, 1),
                 )
-                rendering |= {"spectra": of_plane.to(like), "weights": of_channel.to(like), "owner": None}
+                rendering |= {"spectra": of_plane.to(like), "weights": of_channel.to(like), "shares": None}
         psfs = self._over_field(picture, vergences, scene.wavelengths, traced=traced)
 
         def render(
@@ -737,5 +734,5 @@ class Imaging(Stage):
     def _rendering(self, scene: Scene) -> dict[str, Any]:
         """What a `Renderer` is told beside its tensors."""
         own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
-        owner, cache = self.groups(scene.wavelengths), self._transfer_cache
-        return own | {"border": self.border, "picture": tuple(scene.shape[-2:]), "owner": owner, "cache": cache}
+        shares, cache = self.shares(scene.wavelengths), self._transfer_cache
+        return own | {"border": self.border, "picture": tuple(scene.shape[-2:]), "shares": shares, "cache": cache}

@@ -172,10 +172,11 @@ class Evaluator:
         """Whether all wavelengths may be compared at no cost."""
         return self.spectra is not None and all(spectra.tabled(settings) for spectra in self.spectra)
 
-    def error(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
+    def error(self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False) -> float:
         """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes.
 
-        By spectra light beyond the full well counts too, so that they say at least as much.
+        By spectra light beyond the full well counts too, so that they say at least as much. roughly: see
+        `Spectra.energies`.
         """
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
             return _error(self.samples, self.answers(changes), self.answers(against))
@@ -183,7 +184,7 @@ class Evaluator:
             return self._hidden(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
-            found += self._relative(sample, torch.stack(spectra.energies(changes, against)))
+            found += self._relative(sample, torch.stack(spectra.energies(changes, against, roughly=roughly)))
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:

@@ -16,8 +16,8 @@ import torch
 from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
-from kcam.planner.evaluation import CROP, Evaluator
-from kcam.planner.spectra import FEW_BANDS, WINDOWS, even_counts
+from kcam.planner.evaluation import CROP, HARDLY, Evaluator
+from kcam.planner.spectra import FEW_BANDS, WINDOWS, between, counts, even_counts, hides
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -31,6 +31,15 @@ FASTEST = 2.0
 
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
+
+BY_LINES, BY_ONE = 5.0, 4.0
+"""How many times too large or too small errors may be, of the PSF's window by line spreads instead of PSFs, and of the
+samples of a pupil at one wavelength instead of a few: of 300 random pairs they are 0.18 to 5.5 and 0.13 to 1.8 times
+those, and 0.9 times in the median.
+"""
+
+LITTLE = 0.2
+"""Of the error that there may be, that a rough estimate may be at its largest and be taken."""
 
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
@@ -62,6 +71,8 @@ class Ladder:
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
+    sure: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether it is
+    asked once, of the rung below the top: if not even that may do, none is looked at.
     doubtful: whether it is left out where its foot saves no time; urgency: how much more its error counts than others'
     where the next ladder to climb is chosen.
     """
@@ -74,10 +85,13 @@ class Ladder:
     alternatives: Callable[[Level], list[Level]] | None = None
     follows: Ladder | None = None
     settled: float = math.inf
+    sure: float = 1.0
+    from_top: bool = False
     doubtful: bool = False
     urgency: float = 1.0
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
+    roughly: dict[tuple[int, int], float] = field(default_factory=dict)
     compared: set[tuple[int, int]] = field(default_factory=set)
 
     @property
@@ -92,8 +106,9 @@ class Ladder:
 
     @property
     def error(self) -> float:
-        """Estimated, of the rung that it stands on."""
-        return 0.0 if self.at_top else self.errors[self._key(self.position)]
+        """Estimated, of the rung that it stands on; what is known roughly alone as large as it may be."""
+        key = self._key(self.position)
+        return 0.0 if self.at_top else self.errors[key] if key in self.errors else self.sure * self.roughly[key]
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -106,23 +121,40 @@ class Ladder:
         position, below = self.follows.position, self.follows.levels[: self.follows.position]
         return next((index for index, level in enumerate(below) if level.fineness >= self.settled), position)
 
-    def price(self, evaluator: Evaluator) -> None:
-        """Estimate the error of the rung that it stands on."""
+    def price(self, evaluator: Evaluator, most: float) -> None:
+        """Estimate the error of the rung that it stands on, of which there may be so much at most."""
+        last = len(self.levels) - 2
+        if self.from_top and self.position == 0 <= last and self._roughly(evaluator, last) > self.sure * most:
+            self.position = last + 1
         key = self._key(self.position)
         if self.at_top or key in self.errors:
             return
         if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing, one PSF has one colour
             self.errors[key] = 0.0
-            return
-        if self.successive:
+        elif self.successive:
             self.errors[key] = self._beyond(evaluator)
-            return
+        elif self.sure == 1 or self.from_top or not self._settled(self._roughly(evaluator, self.position), most):
+            self.levels[self.position], self.errors[key] = self._best(evaluator, self.position)
+
+    def _best(self, evaluator: Evaluator, position: int, *, roughly: bool = False) -> tuple[Level, float]:
+        """Of a rung and its alternatives that with the smallest error."""
         beside = self.beside | (self.follows.levels[self._followed].changes if self.follows else {})
-        candidates = [self.level] + (self.alternatives(self.level) if self.alternatives else [])
+        level = self.levels[position]
+        candidates = [level] + (self.alternatives(level) if self.alternatives else [])
         top = beside | self.levels[-1].changes
-        errors = [evaluator.error(beside | level.changes, top) for level in candidates]
+        errors = [evaluator.error(beside | level.changes, top, roughly=roughly) for level in candidates]
         best = min(range(len(errors)), key=errors.__getitem__)
-        self.levels[self.position], self.errors[key] = candidates[best], errors[best]
+        return candidates[best], errors[best]
+
+    def _roughly(self, evaluator: Evaluator, position: int) -> float:
+        key = self._key(position)
+        if key not in self.roughly:
+            self.roughly[key] = self._best(evaluator, position, roughly=True)[1]
+        return self.roughly[key]
+
+    def _settled(self, roughly: float, most: float) -> bool:
+        """Whether a rough estimate says enough: that this may do in any case, or in none."""
+        return self.sure * roughly <= LITTLE * most or roughly > self.sure * most
 
     def _beyond(self, evaluator: Evaluator) -> float:
         """What is left from here to where rungs converge, by the steps up to here: that of the foot by the next one.
@@ -160,7 +192,7 @@ class Ladder:
         self.position += 1
         while self.successive and not self.at_top and self._at_best(before) > most:
             self.position += 1
-        self.price(evaluator)
+        self.price(evaluator, most)
 
     def _at_best(self, known: int) -> float:
         """The error of this rung, if from a known one it fell as fast as any."""
@@ -170,8 +202,9 @@ class Ladder:
         """The number that decided."""
         if self.position == 0:
             return "" if len(self.levels) == 1 else "the least there is suffices"
-        below = max(key for key in self.errors if key[0] < self.position)
-        return f"{self.levels[below[0]].label} would cost {self.errors[below]:.2g}"
+        known = self.roughly | self.errors
+        below = max(key for key in known if key[0] < self.position)
+        return f"{self.levels[below[0]].label} would cost {known[below]:.2g}"
 
 
 def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:
@@ -221,6 +254,11 @@ class _View:
         """Rows and columns of places so far apart at most [pixels]."""
         height, width = self.scene.shape[1:]
         return 1 + math.ceil((height - 1) / apart), 1 + math.ceil((width - 1) / apart)
+
+    @property
+    def lines(self) -> float:
+        """How sure errors of a window are by line spreads, where there are any."""
+        return BY_LINES if self.evaluator.certain and self.row is not None and self.row.lines_of is not None else 1.0
 
     @property
     def shift(self) -> str:
@@ -277,7 +315,8 @@ def _sampling(view: _View) -> Iterator[Ladder]:
         return
     own = imaging.accuracy.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
-    yield Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.beside, doubtful=True)
+    top = Level(f"kappa {own:g}", {}, own)
+    yield Ladder("pupil samples", [*levels, top], view.beside, doubtful=True, sure=BY_ONE)
 
 
 def _precision(view: _View) -> Iterator[Ladder]:
@@ -288,13 +327,17 @@ def _precision(view: _View) -> Iterator[Ladder]:
 
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
+    """Where nothing hides anything and all are compared at no cost, those between a few; else groups."""
     beside = view.few(bands=False)
-    tabled, counts = view.evaluator.tabled(beside), even_counts(view.bands)
-    if view.one and not tabled and not view.stand_in:  # half of the PSFs would save what it takes to find out
-        counts = [n for n in counts if 3 * n <= view.bands]
-    levels = [Level(f"{n} PSFs" if n > 1 else "1 PSF", {"bands": n}, n) for n in counts]
-    top = Level(f"{view.bands} PSFs", {}, view.bands)
-    yield Ladder("wavelengths", [*levels, top], beside, successive=view.computed and not tabled)
+    successive = view.computed and not view.evaluator.tabled(beside)
+    if successive or any(hides(view.imaging, scene) for scene in view.evaluator.scenes):
+        few: list[dict[str, Any]] = [{"bands": n} for n in even_counts(view.bands)]
+    else:
+        few, beside = [between(n) for n in counts(view.bands)], beside | {"occlusion": False}
+    if view.one and successive and not view.stand_in:  # half of the PSFs would save what it takes to find out
+        few = [changes for changes in few if 3 * changes["bands"] <= view.bands]
+    levels = [Level(f"{n} PSFs" if (n := changes["bands"]) > 1 else "1 PSF", changes, n) for changes in few]
+    yield Ladder("wavelengths", [*levels, Level(f"{view.bands} PSFs", {}, view.bands)], beside, successive=successive)
 
 
 def _rank(view: _View) -> Iterator[Ladder]:
@@ -317,6 +360,8 @@ def _depth(view: _View) -> Iterator[Ladder]:
     yield layers
     if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
+        if view.one and any(one.hidden >= HARDLY for one in view.evaluator.items):
+            levels = levels[1:]  # what would be saved is less than what it takes to find out
         yield Ladder("occlusion", levels, beside, follows=layers, settled=HIDING)
 
 
@@ -333,7 +378,9 @@ def _support(view: _View) -> Iterator[Ladder]:
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    yield Ladder("PSF support", [*levels, top], view.few(window=False), alternatives=rescaled)
+    yield Ladder(
+        "PSF support", [*levels, top], view.few(window=False), alternatives=rescaled, sure=view.lines, from_top=True
+    )
 
 
 def _field(view: _View) -> Iterator[Ladder]:

@@ -312,7 +312,7 @@ def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator
         for follows in (False, True):
             own = [ladder for ladder in relevant if follows or not (isinstance(ladder, Ladder) and ladder.follows)]
             for ladder in own:
-                ladder.price(evaluator)
+                ladder.price(evaluator, most)
             if sum(ladder.error for ladder in own) > most:
                 max(own, key=_urgency).climb(evaluator, most)
                 break
@@ -349,7 +349,7 @@ class _Skip:
         """Whether it is kept."""
         return self.position == len(self.forms)
 
-    def price(self, evaluator: Evaluator) -> None:
+    def price(self, evaluator: Evaluator, most: float) -> None:
         """It is known."""
 
     def climb(self, evaluator: Evaluator, most: float) -> None:

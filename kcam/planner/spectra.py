@@ -25,7 +25,7 @@ from kcam.camera import Camera
 from kcam.isp import Clip
 from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.question import Query
-from kcam.optics.propagation.row import Transfer
+from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.source import Points
@@ -34,11 +34,15 @@ from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, 
 from kcam.sensor.mosaic import pattern_tile
 from kcam.sensor.noise import Mean
 
-LINEAR = {"blur", "bands", "psf_shape", "renormalise", "kappa", "propagator", "layers", "occlusion"}
+LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
+LINEAR |= {"layers", "occlusion"}
 """Changes of an Imaging that act as transfer functions do, and that of what hides what."""
 
 WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 """Of these, those whose error is that of the PSFs themselves, not of what they are computed for."""
+
+WINDOW = {"psf_shape", "renormalise"}
+"""Of those, those that line spreads tell roughly."""
 
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 """Sides of the windows of PSFs that may stand for the whole [pixels]."""
@@ -98,6 +102,7 @@ class Spectra:
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
+        self._rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator
         self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
@@ -149,18 +154,24 @@ class Spectra:
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
         own = self.wavelengths
-        groups = (self.imaging.changed(bands=n).psf_wavelengths(own) for n in (None, FEW_BANDS, *even_counts(len(own))))
-        return torch.cat([*groups, self.imaging.psf_wavelengths(own)]).unique()
+        few: list[dict[str, Any]] = [{"bands": None}, {"bands": FEW_BANDS}, {}]
+        few += [{"bands": n} for n in even_counts(len(own))] if self._hides else map(between, counts(len(own)))
+        return torch.cat([self.imaging.changed(**changes).psf_wavelengths(own) for changes in few]).unique()
 
-    def energies(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    def energies(
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
+    ) -> tuple[Tensor, Tensor]:
         """For each row: the energy of the difference that changes make, and that of what it is against, (B,); of
-        different layers, where that has the finer ones.
+        different layers, where that has the finer ones. roughly: of windows by line spreads, of others at one
+        wavelength.
         """
+        if roughly and not _differ(changes, against, WINDOW):
+            changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
-            off, all_of_it = self._linear(changes, against)
+            off, all_of_it = self._linear(changes, against, roughly=roughly)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
-            hiding, even = self._masks._linear(changes, against)
+            hiding, even = self._masks._linear(changes, against, roughly=roughly)
             return off + self.hidden * hiding / even.clamp(min=1e-300) * all_of_it, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
 
@@ -171,9 +182,11 @@ class Spectra:
         ours, theirs = (imaging(grey).double().cpu() for imaging in changed)
         return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
 
-    def _linear(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    def _linear(
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
+    ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        exactly = any(changes.get(name) != against.get(name) for name in WITH_PSFS)
+        exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
@@ -240,9 +253,9 @@ class Spectra:
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
-        owner = imaging.groups(scene.wavelengths)
+        shares = imaging.shares(scene.wavelengths)
         shaped = torch.empty(1, transfer.shape[1], 1, 1, dtype=torch.float64)
-        mixing = Renderer(shaped, spectra=spectra, weights=self.weights, picture=(1, 1), owner=owner).mixing()
+        mixing = Renderer(shaped, spectra=spectra, weights=self.weights, picture=(1, 1), shares=shares).mixing()
         mixed = mixing.flatten(0, 1).to(transfer.dtype) @ transfer.flatten(2).transpose(0, 1).flatten(1)
         mixed = mixed.view(len(mixing), -1, len(transfer), 2, len(self.frequencies))
         return mixed.flatten(1, 2)
@@ -277,8 +290,7 @@ class Spectra:
 
     @property
     def _hides(self) -> bool:
-        """Whether one part of the scene may hide another."""
-        return self.imaging.accuracy.occlusion and torch.as_tensor(self.scene.depth).ndim > 1
+        return hides(self.imaging, self.scene)
 
     @functools.cached_property
     def fits(self) -> bool:
@@ -330,12 +342,21 @@ class Spectra:
         window, some = self._window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
         key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
-            lines = None
-            if (query := self._query(imaging, vergences, some, window)) is not None:
-                row = imaging.accuracy.row(replace(query, wavelengths=self._few))  # the price of all takes as long
-                lines = row.lines(query)
+            query, propagator = self._query(imaging, vergences, some, window), imaging.accuracy.propagator
+            if query is not None and propagator not in self._rows:  # the price of all wavelengths takes as long
+                self._rows[propagator] = imaging.accuracy.row(replace(query, wavelengths=self._few))
+            lines = None if query is None else self._rows[propagator].lines(query)
             self._tables[key] = None if lines is None else _Table(some.tolist(), lines)
         return self._tables[key]
+
+
+def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
+    return any(changes.get(name) != against.get(name) for name in names)
+
+
+def hides(imaging: Imaging, scene: Scene) -> bool:
+    """Whether one part of a scene may hide another."""
+    return imaging.accuracy.occlusion and torch.as_tensor(scene.depth).ndim > 1
 
 
 def _compressed(scene: Scene) -> Scene:
@@ -362,12 +383,27 @@ def even_counts(total: int) -> list[int]:
     Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are closer to all than 12
     are, and 14 than 23.
     """
-    counts = [1]
-    while counts[-1] < total:
-        near = range(math.ceil(1.5 * counts[-1]), math.floor(2.5 * counts[-1]) + 1)
+    found = [1]
+    while found[-1] < total:
+        near = range(math.ceil(1.5 * found[-1]), math.floor(2.5 * found[-1]) + 1)
         even = [count for count in near if total % count == 0]
-        counts.append(even[-1] if even else 2 * counts[-1])
-    return [count for count in counts if count < total]
+        found.append(even[-1] if even else 2 * found[-1])
+    return [count for count in found if count < total]
+
+
+def counts(total: int) -> list[int]:
+    """Numbers of wavelengths between whose PSFs all others lie, ascending, each about half as many again as the one
+    before; up to two thirds of all, beyond which next to nothing is saved.
+    """
+    found = [1]
+    while max(found[-1] + 1, found[-1] * 3 // 2) <= 2 * total / 3:
+        found.append(max(found[-1] + 1, found[-1] * 3 // 2))
+    return [count for count in found if count < total]
+
+
+def between(count: int) -> dict[str, Any]:
+    """Changes of an Imaging: the PSFs of so many wavelengths, and those between them; of what hides nothing."""
+    return {"bands": count, "interpolate_bands": True, "occlusion": False}
 
 
 def linear(camera: Camera) -> bool:

@@ -90,17 +90,20 @@ def test_a_large_picture_is_cut_into_even_squares(seed: int, monkeypatch: pytest
 
 @pytest.mark.parametrize("way", [{}, *WAYS.values()], ids=["whole", *WAYS])
 @pytest.mark.parametrize("content", CONTENTS)
-def test_bands_that_share_a_psf(content: str, way: dict) -> None:
-    """The same as a bank in which each band has its copy, whatever is contracted first."""
+@pytest.mark.parametrize("between", [False, True], ids=["one PSF", "between PSFs"])
+def test_bands_that_share_psfs(content: str, way: dict, between: bool) -> None:
+    """The same as a bank in which each band has its own, whatever is contracted first."""
     factors, channels = CONTENTS[content]
     picture, window, bands = (21, 18), (6, 9), 7
-    owner = torch.tensor([1, 0, 0, 1, 2, 2, 1])
+    shares = torch.nn.functional.one_hot(torch.tensor([1, 0, 0, 1, 2, 2, 1])).double()
+    if between:
+        shares = random(bands, 3, seed=5)
     spectra = None if factors is None else random(factors, bands, seed=3)
     weights = None if channels is None else random(channels, bands, seed=4)
     planes, few = random(2, factors or bands, *picture, seed=1), random(1, 3, *window, seed=2)
     fixed = {"spectra": spectra, "weights": weights, "picture": picture}
-    shared = Renderer(few, owner=owner, **fixed, **way)
-    copied = Renderer(few[:, owner], **fixed)
+    shared = Renderer(few, shares=shares, **fixed, **way)
+    copied = Renderer(torch.einsum("lg,zghw->zlhw", shares, few), **fixed)
     torch.testing.assert_close(shared.blur(planes, layer=0), copied.blur(planes, layer=0))
     mask = random(2, 1, *picture, seed=6)
     torch.testing.assert_close(shared.coverage(mask, layer=0), copied.coverage(mask, layer=0))

@@ -39,7 +39,7 @@ class Bank:
     spectra: Tensor | None  # (K, L) of the planes, or None where the planes are the bands
     weights: Tensor | None  # (C, L) of the channels, or None for all bands
     picture: tuple[int, int]
-    owner: Tensor | None = None  # (L,) which of the G PSFs each band takes; None where each has its own
+    shares: Tensor | None = None  # (L, G) of the PSFs in that of each band; None where each has its own
     border: str = "reflect"  # what lies beyond the picture, one of `BORDERS`
     direct: bool = False  # sum over the window instead of by FFT; with the same result, faster for small windows
     tile: int | None = None  # side of squares that the picture is cut into [pixels]; None: those of a large one
@@ -49,7 +49,7 @@ class Bank:
     def __post_init__(self) -> None:
         self.layers, self.groups, *window = self.psfs.shape
         self.window = (window[0], window[1])
-        self.bands = self.groups if self.owner is None else len(self.owner)
+        self.bands = self.groups if self.shares is None else len(self.shares)
         self.planes = self.bands if self.spectra is None else len(self.spectra)
         self.channels = self.bands if self.weights is None else len(self.weights)
         height, width = self.square = self.picture  # what is convolved at once
@@ -78,21 +78,18 @@ class Bank:
 
     def of_bands(self, psfs: Tensor) -> Tensor:
         """The PSF of each band, (L, h, w)."""
-        return psfs if self.owner is None else psfs[self.owner.to(psfs.device)]
+        return psfs if self.shares is None else torch.einsum("lg,ghw->lhw", self.shares.to(psfs), psfs)
 
     def grouped(self, weights: Tensor) -> Tensor:
-        """Weights of the bands, (..., L), added up over those that share a PSF: (..., G)."""
-        if self.owner is None:
-            return weights
-        sums = weights.new_zeros(*weights.shape[:-1], self.groups)
-        return sums.index_add(-1, self.owner.to(weights.device), weights)
+        """Weights of the bands, (..., L), as weights of the PSFs that they take theirs from: (..., G)."""
+        return weights if self.shares is None else weights @ self.shares.to(weights)
 
     def kappa(self) -> Tensor:
         """Weights (C, L) of the channels, which without a filter are the bands."""
         return torch.eye(self.bands).to(self.psfs) if self.weights is None else self.weights
 
     def mixing(self) -> Tensor:
-        """M_ckg, the sum of kappa_cl S_kl over the bands of a group: (C, K, G)."""
+        """M_ckg, the sum of kappa_cl S_kl over the bands that take of a PSF: (C, K, G)."""
         spectra = torch.eye(self.bands).to(self.psfs) if self.spectra is None else self.spectra  # bands are planes too
         return self.grouped(self.kappa()[:, None] * spectra)
 
