@@ -48,9 +48,9 @@ class Accuracy(Recipe):
         blur: False lets each point light its own pixel only.
         bands: number of wavelengths whose PSFs are computed; None: all. Fewer: neighbouring bands share the PSF of
             their group's mean wavelength, whatever their number.
-        interpolate_bands: of fewer, give each band the cubic in 1/wavelength through the PSFs of the four nearest,
-            often right to as much with half as many. It may be below zero, so layers must not hide each other then:
-            occlusion=False, which scenes at one distance do not notice.
+        interpolate_bands: of fewer, give each band the cubic in 1/wavelength through the PSFs of the four nearest: once
+            they resolve the fringes errors fall with the third power of their number, not the first. Such PSFs may be
+            below zero: where layers of depth hide each other, and over the field, bands share a PSF all the same.
         psf_shape: (H, W) of the PSF's window in pixels; None: see `Imaging.psf_window`.
         renormalise: give a PSF that psf_shape cuts its whole light again.
         layers: number of depth layers over the range of a depth map, at equal steps of 1/z, or their distances [m];
@@ -74,8 +74,7 @@ class Accuracy(Recipe):
             megapixels is cut.
         direct: convolve in the picture, without a Fourier transform: faster for small windows.
     Raises: ValueError for an unknown propagator, coverage or precision, a shape, count or memory that is not positive,
-        a distance not in metres, a kappa of 1 or less, bands interpolated with occlusion; TypeError for layers that are
-        neither a number nor distances.
+        a distance not in metres, a kappa of 1 or less; TypeError for layers that are neither a number nor distances.
 
     Example:
     >>> lens = optics.Lens(optics.CircularAperture(5 * mm), optics.ThinLens(50 * mm), focus_distance=2.0)
@@ -119,11 +118,6 @@ class Accuracy(Recipe):
             raise ValueError(f"psf_shape must be two positive integers (H, W) in pixels, or None, got {shape!r}.{fix}")
         if self.kappa is not None and not self.kappa > 1:
             raise ValueError(f"kappa must be above 1 sample per fringe, got {self.kappa:g}. Its default is {KAPPA:g}.")
-        if self.interpolate_bands and self.occlusion:
-            raise ValueError(
-                "interpolate_bands=True gives PSFs that may be below zero, and layers that hide each other need what "
-                "covers. Use occlusion=False, or interpolate_bands=False."
-            )
         if self.precision not in (None, "float32", "float64"):
             raise ValueError(
                 f'precision must be "float32", "float64" or None for the scene\'s, got {self.precision!r}.'

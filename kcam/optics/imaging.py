@@ -352,33 +352,35 @@ class Imaging(Stage):
         shares = self.shares(wavelengths)
         return psfs.clone() if shares is None else torch.einsum("lg,zghw->zlhw", shares.to(psfs), psfs)
 
-    def _few(self, wavelengths: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _few(self, wavelengths: Tensor, *, hides: bool) -> tuple[Tensor, Tensor | None]:
         count, accuracy = len(wavelengths), self.accuracy
         if accuracy.blur and (accuracy.bands is None or accuracy.bands >= count):
             return wavelengths, None
-        few = (accuracy.bands or count) if accuracy.blur else 1
-        return few_wavelengths(wavelengths, few, interpolate=accuracy.interpolate_bands)
+        few, between = (accuracy.bands or count) if accuracy.blur else 1, accuracy.interpolate_bands
+        return few_wavelengths(wavelengths, few, interpolate=between and not (hides or self.varies))
 
-    def psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
-        """At which the PSFs are computed, (G,) [m]: the bands', or fewer."""
-        return self._few(wavelengths)[0]
+    def psf_wavelengths(self, wavelengths: Tensor, *, hides: bool = False) -> Tensor:
+        """At which the PSFs are computed, (G,) [m]: the bands', or fewer; hides: whether layers hide each other."""
+        return self._few(wavelengths, hides=hides)[0]
 
-    def shares(self, wavelengths: Tensor) -> Tensor | None:
+    def shares(self, wavelengths: Tensor, *, hides: bool = False) -> Tensor | None:
         """What each of these PSFs gives to each band, (L, G); None where each band has its own."""
-        return self._few(wavelengths)[1]
+        return self._few(wavelengths, hides=hides)[1]
 
-    def _grouped_bank(self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor) -> Tensor:
+    def _grouped_bank(
+        self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor, hides: bool = False
+    ) -> Tensor:
         """PSFs from which the bands take theirs, (Z, G, h, w)."""
         if not self.accuracy.blur:
             return like.new_ones(len(points.vergences), 1, 1, 1)
 
         def build() -> Tensor:
             pixels = self.pixels(shape, like)
-            psfs = self.bank(points, self.psf_wavelengths(wavelengths), pixels)
+            psfs = self.bank(points, self.psf_wavelengths(wavelengths, hides=hides), pixels)
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.accuracy.renormalise else psfs
 
         # the whole stage, lens and all: what the PSFs depend on is not listed by hand
-        where = (points.vergences, points.positions)
+        where = (points.vergences, points.positions, hides)
         return self._bank_cache.get((self, wavelengths, where, shape, like.dtype, like.device), build)
 
     def working(self, scene: Scene) -> Tensor:
@@ -551,13 +553,14 @@ class Imaging(Stage):
             return self._finished(light, weights, afterwards)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         length = self._layers_at_once(bands, window, planes)
-        light = planes.new_zeros(())
+        hides = shares is not None and self.accuracy.occlusion
+        light, rendering = planes.new_zeros(()), self._rendering(scene, hides=hides)
         for position, own in self._zones(planes):
             layers = Layers(own, shares, occlusion=self.accuracy.occlusion)
             for start in range(0, vergences.numel(), length):
                 points = Points(vergences[start : start + length], position)
-                psfs = self._grouped_bank(scene.wavelengths, points=points, shape=window, like=planes)
-                renderer = Renderer(psfs, spectra=spectra, weights=weights, **self._rendering(scene))
+                psfs = self._grouped_bank(scene.wavelengths, points=points, shape=window, like=planes, hides=hides)
+                renderer = Renderer(psfs, spectra=spectra, weights=weights, **rendering)
                 layers.add(renderer, first=start)
             light = layers.light if position is None else light + layers.light
         return self._finished(light, weights, afterwards)
@@ -731,8 +734,8 @@ class Imaging(Stage):
     def _positions(self) -> Tensor | None:
         return getattr(self.lens, "positions", None)
 
-    def _rendering(self, scene: Scene) -> dict[str, Any]:
+    def _rendering(self, scene: Scene, *, hides: bool = False) -> dict[str, Any]:
         """What a `Renderer` is told beside its tensors."""
         own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
-        shares, cache = self.shares(scene.wavelengths), self._transfer_cache
+        shares, cache = self.shares(scene.wavelengths, hides=hides), self._transfer_cache
         return own | {"border": self.border, "picture": tuple(scene.shape[-2:]), "shares": shares, "cache": cache}

@@ -17,7 +17,7 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
-from kcam.planner.spectra import FEW_BANDS, WINDOWS, between, counts, even_counts, hides
+from kcam.planner.spectra import FEW_BANDS, WINDOWS, between, counts, even_counts, hides_any
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -330,10 +330,10 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Where nothing hides anything and all are compared at no cost, those between a few; else groups."""
     beside = view.few(bands=False)
     successive = view.computed and not view.evaluator.tabled(beside)
-    if successive or any(hides(view.imaging, scene) for scene in view.evaluator.scenes):
+    if successive or any(hides_any(view.imaging, scene) for scene in view.evaluator.scenes):
         few: list[dict[str, Any]] = [{"bands": n} for n in even_counts(view.bands)]
     else:
-        few, beside = [between(n) for n in counts(view.bands)], beside | {"occlusion": False}
+        few = [between(n) for n in counts(view.bands)]
     if view.one and successive and not view.stand_in:  # half of the PSFs would save what it takes to find out
         few = [changes for changes in few if 3 * changes["bands"] <= view.bands]
     levels = [Level(f"{n} PSFs" if (n := changes["bands"]) > 1 else "1 PSF", changes, n) for changes in few]

@@ -247,13 +247,14 @@ class Spectra:
         between: what `_between` says of the layers of these changes, if they are others.
         """
         imaging, scene = self.imaging.changed(**changes), self.scene
-        groups = imaging.psf_wavelengths(scene.wavelengths)
+        hides = len(layered.vergences) > 1 and hides_any(imaging, scene)
+        groups = imaging.psf_wavelengths(scene.wavelengths, hides=hides)
         vergences = layered.vergences if between is None else between[0]
         transfer = self._transfer(imaging, vergences, groups, exactly=exactly)  # (Z, G, 2, F)
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
-        shares = imaging.shares(scene.wavelengths)
+        shares = imaging.shares(scene.wavelengths, hides=hides)
         shaped = torch.empty(1, transfer.shape[1], 1, 1, dtype=torch.float64)
         mixing = Renderer(shaped, spectra=spectra, weights=self.weights, picture=(1, 1), shares=shares).mixing()
         mixed = mixing.flatten(0, 1).to(transfer.dtype) @ transfer.flatten(2).transpose(0, 1).flatten(1)
@@ -290,7 +291,7 @@ class Spectra:
 
     @property
     def _hides(self) -> bool:
-        return hides(self.imaging, self.scene)
+        return hides_any(self.imaging, self.scene)
 
     @functools.cached_property
     def fits(self) -> bool:
@@ -354,7 +355,7 @@ def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[s
     return any(changes.get(name) != against.get(name) for name in names)
 
 
-def hides(imaging: Imaging, scene: Scene) -> bool:
+def hides_any(imaging: Imaging, scene: Scene) -> bool:
     """Whether one part of a scene may hide another."""
     return imaging.accuracy.occlusion and torch.as_tensor(scene.depth).ndim > 1
 
@@ -393,17 +394,17 @@ def even_counts(total: int) -> list[int]:
 
 def counts(total: int) -> list[int]:
     """Numbers of wavelengths between whose PSFs all others lie, ascending, each about half as many again as the one
-    before; up to two thirds of all, beyond which next to nothing is saved.
+    before; up to 0.7 of all, beyond which next to nothing is saved.
     """
     found = [1]
-    while max(found[-1] + 1, found[-1] * 3 // 2) <= 2 * total / 3:
+    while max(found[-1] + 1, found[-1] * 3 // 2) <= 0.7 * total:
         found.append(max(found[-1] + 1, found[-1] * 3 // 2))
     return [count for count in found if count < total]
 
 
 def between(count: int) -> dict[str, Any]:
-    """Changes of an Imaging: the PSFs of so many wavelengths, and those between them; of what hides nothing."""
-    return {"bands": count, "interpolate_bands": True, "occlusion": False}
+    """Changes of an Imaging: the PSFs of so many wavelengths, and those between them."""
+    return {"bands": count, "interpolate_bands": True}
 
 
 def linear(camera: Camera) -> bool:

@@ -38,6 +38,7 @@ def random_settings(draw: Draw) -> dict[str, typing.Any]:
         "kappa": 3.0,
         "blur": False,
         "bands": draw.one_of(1, 2, 3, 4),
+        "interpolate_bands": True,
         "psf_shape": (draw.one_of(3, 6, 9), draw.one_of(4, 7)),
         "renormalise": True,
         "layers": draw.one_of(3, (1.9, 1.1)),

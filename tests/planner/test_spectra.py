@@ -15,6 +15,7 @@ from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
 from kcam.planner.evaluation import Evaluator, _error
 from kcam.planner.ladders import Ladder, Level
+from kcam.planner.spectra import counts as between_counts
 from kcam.planner.spectra import even_counts
 from kcam.units import mm, um, wavelength_grid
 
@@ -22,6 +23,7 @@ CHANGES = [
     ({"bands": 3, "blur": False}, {"bands": 3}),
     ({"bands": 1}, {"bands": 2}),
     ({"bands": 4}, {"bands": 7}),
+    ({"bands": 3, "interpolate_bands": True}, {"bands": 9, "interpolate_bands": True}),
     ({"bands": 2, "psf_shape": (9, 9)}, {"bands": 2}),
     ({"bands": 2, "psf_shape": (33, 17), "renormalise": True}, {"bands": 2}),
 ]
@@ -94,7 +96,7 @@ def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int)
         return left(ours["bands"]) - left(theirs["bands"])
 
     evaluator, ladder = SimpleNamespace(error=step), Ladder("wavelengths", levels, {}, successive=True)
-    ladder.price(evaluator)
+    ladder.price(evaluator, math.inf)
     seen = []
     while not ladder.at_top:
         truth = left(counts[ladder.position]) - left(total)
@@ -102,6 +104,62 @@ def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int)
         seen.append(ladder.position)
         ladder.climb(evaluator, math.inf)
     assert len(seen) > len(set(seen))  # some were looked at twice before they were left
+
+
+@pytest.mark.parametrize(
+    ("total", "expected"),
+    [(28, [1, 2, 3, 4, 6, 9, 13, 19]), (1, []), (2, [1]), (3, [1, 2]), (9, [1, 2, 3, 4, 6])],
+)
+def test_wavelengths_between_which_others_lie(total: int, expected: list[int]) -> None:
+    assert between_counts(total) == expected
+
+
+@pytest.mark.parametrize("truth", [1e-5, 1e-3, 2e-2, 1.0])
+@pytest.mark.parametrize("off", [1 / 4, 1.0, 4.0])
+def test_a_rough_estimate_settles_only_what_it_may(truth: float, off: float) -> None:
+    """However far it is off within what it says of itself: no rung is taken that may not do, nor one refused that does,
+    and what is stated is at least the truth.
+    """
+    most, asked = 0.01, []
+
+    def error(ours: dict, theirs: dict, *, roughly: bool) -> float:
+        asked.append(roughly)
+        return truth * off if roughly else truth
+
+    evaluator = SimpleNamespace(error=error)
+    levels = [Level("coarse", {"kappa": 1.3}), Level("fine", {})]
+    ladder = Ladder("pupil samples", levels, {}, sure=4.0)
+    ladder.price(evaluator, most)
+    assert (ladder.error <= most) == (truth <= most)
+    assert ladder.error >= truth
+    assert asked[0]
+    assert len(asked) == (1 if 4 * truth * off <= 0.2 * most or truth * off > 4 * most else 2)
+    before = len(asked)
+    ladder.price(evaluator, truth)  # for a tolerance at which it is asked more of
+    assert ladder.error <= truth or len(asked) == before
+
+
+@pytest.mark.parametrize(("last", "looked_at"), [(1.0, 0), (0.04, 1)])
+def test_windows_of_which_not_even_the_largest_may_do_are_not_looked_at(last: float, looked_at: int) -> None:
+    exactly = []
+
+    def error(ours: dict, theirs: dict, *, roughly: bool) -> float:
+        if roughly:
+            return last
+        exactly.append(ours["psf_shape"])
+        return 0.5 / ours["psf_shape"][0]
+
+    evaluator = SimpleNamespace(error=error)
+    levels = [Level(str(side), {"psf_shape": (side, side)}, side) for side in (5, 65, 129)]
+    ladder = Ladder("PSF support", [*levels, Level("all", {})], {}, sure=5.0, from_top=True)
+    for most in (0.01, 0.003):
+        ladder.position = 0
+        ladder.price(evaluator, most)
+        while ladder.error > most:
+            ladder.climb(evaluator, most)
+        assert ladder.level.label == ("65" if looked_at and most == 0.01 else "all")
+    assert bool(exactly) == bool(looked_at)
+    assert ladder.why() == f"129 would cost {last:g}"
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
@@ -117,7 +175,7 @@ def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> No
 
     evaluator = SimpleNamespace(error=step)
     ladder = Ladder("wavelengths", [Level(str(n), {"bands": n}, n) for n in counts], {}, successive=True)
-    ladder.price(evaluator)
+    ladder.price(evaluator, most)
     while ladder.error > most and not ladder.at_top:
         ladder.climb(evaluator, most)
     truth = counts[ladder.position] ** -order - counts[-1] ** -order
