@@ -152,8 +152,11 @@ class Imaging(Stage):
         return {name: getattr(self, name) for name in names} | self.accuracy.settings()
 
     def extra_repr(self) -> str:
-        """The arguments, but for those of optics that vary over the picture where these do not."""
-        return arguments_text(self, but=() if self.varies else OVER_THE_FIELD)
+        """The arguments, but for those of optics that vary over the picture where these do not, and how PSFs lie between
+        few where they do not.
+        """
+        between = () if self.accuracy.interpolate_bands else ("interpolate_bands",)
+        return arguments_text(self, but=between + (() if self.varies else OVER_THE_FIELD))
 
     def changed(self, **arguments: Any) -> Imaging:
         """The same stage with some of its constructor's arguments changed; it shares the lens and what is known of its
