@@ -53,6 +53,11 @@ class Absorber(Curves, Protocol):
         """What the filter makes of the channels' light (B, C, H, W)."""
 
 
+def is_deep(scene: Scene) -> bool:
+    """Whether a scene has a map of depth, of which one part may hide another."""
+    return torch.as_tensor(scene.depth).ndim > 1
+
+
 def _checked_centre(centre: tuple[float, float]) -> tuple[float, float]:
     numbers = as_values(centre, name="centre", unit="m").reshape(-1)
     if numbers.shape != (2,) or not bool((numbers.abs() < 1).all()):
@@ -152,11 +157,9 @@ class Imaging(Stage):
         return {name: getattr(self, name) for name in names} | self.accuracy.settings()
 
     def extra_repr(self) -> str:
-        """The arguments, but for those of optics that vary over the picture where these do not, and how PSFs lie between
-        few where they do not.
-        """
-        between = () if self.accuracy.interpolate_bands else ("interpolate_bands",)
-        return arguments_text(self, but=between + (() if self.varies else OVER_THE_FIELD))
+        """The arguments, but for those of optics that vary over the picture where these do not, and what is off."""
+        off = () if self.accuracy.interpolate_bands else ("interpolate_bands",)
+        return arguments_text(self, but=off + (() if self.varies else OVER_THE_FIELD))
 
     def changed(self, **arguments: Any) -> Imaging:
         """The same stage with some of its constructor's arguments changed; it shares the lens and what is known of its
@@ -348,43 +351,45 @@ class Imaging(Stage):
         return self.lens.defocus(wavelengths, self.pixel_pitch) if self.accuracy.blur else Defocus()
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
-        """PSFs of the bands of a scene, (Z, L, h, w) in the dtype and on the device of `like`; kept while nothing
-        changes. The caller's own: it may be changed in place.
+        """PSFs of the bands of a scene at one distance, (Z, L, h, w) in the dtype and on the device of `like`; kept
+        while nothing changes. The caller's own: it may be changed in place.
         """
         psfs = self._grouped_bank(wavelengths, points=Points(vergences), shape=shape, like=like)
         shares = self.shares(wavelengths)
-        return psfs.clone() if shares is None else torch.einsum("lg,zghw->zlhw", shares.to(psfs), psfs)
+        with full_precision(psfs.device):
+            return psfs.clone() if shares is None else torch.einsum("lg,zghw->zlhw", shares.to(psfs), psfs)
 
-    def _few(self, wavelengths: Tensor, *, hides: bool) -> tuple[Tensor, Tensor | None]:
+    def _few(self, wavelengths: Tensor, *, deep: bool) -> tuple[Tensor, Tensor | None]:
         count, accuracy = len(wavelengths), self.accuracy
         if accuracy.blur and (accuracy.bands is None or accuracy.bands >= count):
             return wavelengths, None
         few, between = (accuracy.bands or count) if accuracy.blur else 1, accuracy.interpolate_bands
-        return few_wavelengths(wavelengths, few, interpolate=between and not (hides or self.varies))
+        return few_wavelengths(wavelengths, few, interpolate=between and not (deep or self.varies))
 
-    def psf_wavelengths(self, wavelengths: Tensor, *, hides: bool = False) -> Tensor:
-        """At which the PSFs are computed, (G,) [m]: the bands', or fewer; hides: whether layers hide each other."""
-        return self._few(wavelengths, hides=hides)[0]
+    def psf_wavelengths(self, wavelengths: Tensor, *, deep: bool = False) -> Tensor:
+        """At which the PSFs are computed, (G,) [m]: the bands', or fewer; deep: of a scene with a map of depth."""
+        return self._few(wavelengths, deep=deep)[0]
 
-    def shares(self, wavelengths: Tensor, *, hides: bool = False) -> Tensor | None:
+    def shares(self, wavelengths: Tensor, *, deep: bool = False) -> Tensor | None:
         """What each of these PSFs gives to each band, (L, G); None where each band has its own."""
-        return self._few(wavelengths, hides=hides)[1]
+        return self._few(wavelengths, deep=deep)[1]
 
     def _grouped_bank(
-        self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor, hides: bool = False
+        self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor, deep: bool = False
     ) -> Tensor:
         """PSFs from which the bands take theirs, (Z, G, h, w)."""
         if not self.accuracy.blur:
             return like.new_ones(len(points.vergences), 1, 1, 1)
+        nodes = self.psf_wavelengths(wavelengths, deep=deep)
 
         def build() -> Tensor:
             pixels = self.pixels(shape, like)
-            psfs = self.bank(points, self.psf_wavelengths(wavelengths, hides=hides), pixels)
+            psfs = self.bank(points, nodes, pixels)
             return psfs / psfs.sum((-2, -1), keepdim=True) if self.accuracy.renormalise else psfs
 
         # the whole stage, lens and all: what the PSFs depend on is not listed by hand
-        where = (points.vergences, points.positions, hides)
-        return self._bank_cache.get((self, wavelengths, where, shape, like.dtype, like.device), build)
+        where = (points.vergences, points.positions)
+        return self._bank_cache.get((self, nodes, where, shape, like.dtype, like.device), build)
 
     def working(self, scene: Scene) -> Tensor:
         """The scene's planes (B, K, H, W) in the type that is computed in: at least float32."""
@@ -556,13 +561,12 @@ class Imaging(Stage):
             return self._finished(light, weights, afterwards)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         length = self._layers_at_once(bands, window, planes)
-        hides = shares is not None and self.accuracy.occlusion
-        light, rendering = planes.new_zeros(()), self._rendering(scene, hides=hides)
+        light, rendering, deep = planes.new_zeros(()), self._rendering(scene), is_deep(scene)
         for position, own in self._zones(planes):
             layers = Layers(own, shares, occlusion=self.accuracy.occlusion)
             for start in range(0, vergences.numel(), length):
                 points = Points(vergences[start : start + length], position)
-                psfs = self._grouped_bank(scene.wavelengths, points=points, shape=window, like=planes, hides=hides)
+                psfs = self._grouped_bank(scene.wavelengths, points=points, shape=window, like=planes, deep=deep)
                 renderer = Renderer(psfs, spectra=spectra, weights=weights, **rendering)
                 layers.add(renderer, first=start)
             light = layers.light if position is None else light + layers.light
@@ -737,8 +741,8 @@ class Imaging(Stage):
     def _positions(self) -> Tensor | None:
         return getattr(self.lens, "positions", None)
 
-    def _rendering(self, scene: Scene, *, hides: bool = False) -> dict[str, Any]:
+    def _rendering(self, scene: Scene) -> dict[str, Any]:
         """What a `Renderer` is told beside its tensors."""
         own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
-        shares, cache = self.shares(scene.wavelengths, hides=hides), self._transfer_cache
+        shares, cache = self.shares(scene.wavelengths, deep=is_deep(scene)), self._transfer_cache
         return own | {"border": self.border, "picture": tuple(scene.shape[-2:]), "shares": shares, "cache": cache}

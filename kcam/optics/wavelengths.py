@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,29 +16,27 @@ _CUBIC = 4  # nodes
 def few_wavelengths(wavelengths: Tensor, count: int, *, interpolate: bool) -> tuple[Tensor, Tensor]:
     """`count` wavelengths (G,) [m], and the share of each of their PSFs in that of a band, (L, G) in float64.
 
-    Interpolated: the middles of equal steps in 1/wavelength, in which fringes are even, and between them cubics through
-    the four nearest. Else neighbouring bands share the PSF of their group's mean wavelength.
+    Interpolated: the middles of equal steps in 1/wavelength, in which fringes are even, and cubics through the four
+    nearest, which go on for half a step at the ends. Else neighbouring bands share the PSF of their group's mean
+    wavelength.
     """
     nodes, shares = _few(tuple(wavelengths.tolist()), count, interpolate)
-    return nodes.to(wavelengths), shares
+    return torch.tensor(nodes).to(wavelengths), torch.tensor(shares)
 
 
 @functools.lru_cache(maxsize=256)
-@torch.inference_mode(False)
-def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple[Tensor, Tensor]:
-    own = torch.tensor(wavelengths, dtype=torch.float64)
-    low, high = (1 / own).aminmax()
+def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple[np.ndarray, np.ndarray]:
+    own = np.array(wavelengths)
+    shares = np.zeros((len(own), count))
+    low, high = 1 / own.max(), 1 / own.min()
     if not interpolate or low == high:
-        owner = torch.empty(len(own), dtype=torch.long)
-        for index, group in enumerate(own.argsort().tensor_split(count)):
-            owner[group] = index
-        shares = torch.nn.functional.one_hot(owner).double()
-        return (own @ shares) / shares.sum(0), shares
+        for index, group in enumerate(np.array_split(own.argsort(kind="stable"), count)):
+            shares[group, index] = 1
+        return own @ shares / shares.sum(0), shares
     step = (high - low) / count
     place = (1 / own - low) / step - 0.5
     order = min(count, _CUBIC)
-    first = (place.floor().long() - (order // 2 - 1)).clamp(0, count - order)
-    shares = torch.zeros(len(own), count, dtype=torch.float64)
+    first = np.clip(np.floor(place).astype(int) - (order // 2 - 1), 0, count - order)
     for tap, weight in enumerate(lagrange(place - first, taps=range(order))):
-        shares[torch.arange(len(own)), first + tap] = weight
-    return 1 / (low + step * (torch.arange(count, dtype=torch.float64) + 0.5)), shares
+        shares[np.arange(len(own)), first + tap] = weight
+    return 1 / (low + step * (np.arange(count) + 0.5)), shares

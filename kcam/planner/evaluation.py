@@ -172,6 +172,10 @@ class Evaluator:
         """Whether all wavelengths may be compared at no cost."""
         return self.spectra is not None and all(spectra.tabled(settings) for spectra in self.spectra)
 
+    def by_lines(self, settings: Mapping[str, Any]) -> bool:
+        """Whether line spreads tell roughly what a window costs."""
+        return self.spectra is not None and all(spectra.by_lines(settings) for spectra in self.spectra)
+
     def error(self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False) -> float:
         """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes.
 

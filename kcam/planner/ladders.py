@@ -14,10 +14,11 @@ from typing import Any
 import torch
 
 from kcam.optics import Imaging, Lens
+from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
-from kcam.planner.spectra import FEW_BANDS, WINDOWS, between, counts, even_counts, hides_any
+from kcam.planner.spectra import FEW_BANDS, WINDOWS, even_counts, interpolated, node_counts
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -32,10 +33,10 @@ FASTEST = 2.0
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
 
-BY_LINES, BY_ONE = 5.0, 4.0
-"""How many times too large or too small errors may be, of the PSF's window by line spreads instead of PSFs, and of the
-samples of a pupil at one wavelength instead of a few: of 300 random pairs they are 0.18 to 5.5 and 0.13 to 1.8 times
-those, and 0.9 times in the median.
+BY_LINES, BY_ONE = 5.0, 8.0
+"""How many times too large or too small rough errors may be: of the PSF's window by line spreads instead of PSFs, which
+only refuse, and of pupil samples at one wavelength instead of a few. Of 300 random pairs they were 0.18 to 5.5, and
+0.13 to 1.8 times the others.
 """
 
 LITTLE = 0.2
@@ -71,8 +72,8 @@ class Ladder:
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
-    sure: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether it is
-    asked once, of the rung below the top: if not even that may do, none is looked at.
+    off_by: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether it
+    is asked once, of the rung below the top: if not even that may do, none is looked at.
     doubtful: whether it is left out where its foot saves no time; urgency: how much more its error counts than others'
     where the next ladder to climb is chosen.
     """
@@ -85,7 +86,7 @@ class Ladder:
     alternatives: Callable[[Level], list[Level]] | None = None
     follows: Ladder | None = None
     settled: float = math.inf
-    sure: float = 1.0
+    off_by: float = 1.0
     from_top: bool = False
     doubtful: bool = False
     urgency: float = 1.0
@@ -108,7 +109,9 @@ class Ladder:
     def error(self) -> float:
         """Estimated, of the rung that it stands on; what is known roughly alone as large as it may be."""
         key = self._key(self.position)
-        return 0.0 if self.at_top else self.errors[key] if key in self.errors else self.sure * self.roughly[key]
+        if self.at_top:
+            return 0.0
+        return self.errors[key] if key in self.errors else self.off_by * self.roughly[key]
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -124,7 +127,12 @@ class Ladder:
     def price(self, evaluator: Evaluator, most: float) -> None:
         """Estimate the error of the rung that it stands on, of which there may be so much at most."""
         last = len(self.levels) - 2
-        if self.from_top and self.position == 0 <= last and self._roughly(evaluator, last) > self.sure * most:
+        if (
+            self.from_top
+            and self.position == 0
+            and not self.at_top
+            and self._roughly(evaluator, last) > self.off_by * most
+        ):
             self.position = last + 1
         key = self._key(self.position)
         if self.at_top or key in self.errors:
@@ -133,7 +141,7 @@ class Ladder:
             self.errors[key] = 0.0
         elif self.successive:
             self.errors[key] = self._beyond(evaluator)
-        elif self.sure == 1 or self.from_top or not self._settled(self._roughly(evaluator, self.position), most):
+        elif self.off_by == 1 or self.from_top or not self._settled(self._roughly(evaluator, self.position), most):
             self.levels[self.position], self.errors[key] = self._best(evaluator, self.position)
 
     def _best(self, evaluator: Evaluator, position: int, *, roughly: bool = False) -> tuple[Level, float]:
@@ -153,8 +161,10 @@ class Ladder:
         return self.roughly[key]
 
     def _settled(self, roughly: float, most: float) -> bool:
-        """Whether a rough estimate says enough: that this may do in any case, or in none."""
-        return self.sure * roughly <= LITTLE * most or roughly > self.sure * most
+        """Whether a rough estimate says enough: that this may do in any case, or in none. Nothing at all is no
+        estimate: one wavelength may have the same grid either way.
+        """
+        return 0 < self.off_by * roughly <= LITTLE * most or roughly > self.off_by * most
 
     def _beyond(self, evaluator: Evaluator) -> float:
         """What is left from here to where rungs converge, by the steps up to here: that of the foot by the next one.
@@ -256,11 +266,6 @@ class _View:
         return 1 + math.ceil((height - 1) / apart), 1 + math.ceil((width - 1) / apart)
 
     @property
-    def lines(self) -> float:
-        """How sure errors of a window are by line spreads, where there are any."""
-        return BY_LINES if self.evaluator.certain and self.row is not None and self.row.lines_of is not None else 1.0
-
-    @property
     def shift(self) -> str:
         """How far distortion moves light, at most."""
         return f"up to {self.imaging.distorted(self.scene):.2g} px"
@@ -316,7 +321,8 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     own = imaging.accuracy.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
     top = Level(f"kappa {own:g}", {}, own)
-    yield Ladder("pupil samples", [*levels, top], view.beside, doubtful=True, sure=BY_ONE)
+    off_by = BY_ONE if view.one and view.evaluator.certain else 1.0
+    yield Ladder("pupil samples", [*levels, top], view.beside, doubtful=True, off_by=off_by)
 
 
 def _precision(view: _View) -> Iterator[Ladder]:
@@ -327,13 +333,13 @@ def _precision(view: _View) -> Iterator[Ladder]:
 
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
-    """Where nothing hides anything and all are compared at no cost, those between a few; else groups."""
+    """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
     beside = view.few(bands=False)
     successive = view.computed and not view.evaluator.tabled(beside)
-    if successive or any(hides_any(view.imaging, scene) for scene in view.evaluator.scenes):
+    if successive or any(is_deep(scene) for scene in view.evaluator.scenes):
         few: list[dict[str, Any]] = [{"bands": n} for n in even_counts(view.bands)]
     else:
-        few = [between(n) for n in counts(view.bands)]
+        few = [interpolated(n) for n in node_counts(view.bands)]
     if view.one and successive and not view.stand_in:  # half of the PSFs would save what it takes to find out
         few = [changes for changes in few if 3 * changes["bands"] <= view.bands]
     levels = [Level(f"{n} PSFs" if (n := changes["bands"]) > 1 else "1 PSF", changes, n) for changes in few]
@@ -378,9 +384,11 @@ def _support(view: _View) -> Iterator[Ladder]:
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    yield Ladder(
-        "PSF support", [*levels, top], view.few(window=False), alternatives=rescaled, sure=view.lines, from_top=True
-    )
+    beside, off_by = view.few(window=False), 1.0
+    if by_lines := view.evaluator.by_lines(beside):
+        off_by = BY_LINES
+    levels = [*levels, top]
+    yield Ladder("PSF support", levels, beside, alternatives=rescaled, off_by=off_by, from_top=by_lines)
 
 
 def _field(view: _View) -> Iterator[Ladder]:

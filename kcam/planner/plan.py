@@ -21,6 +21,7 @@ from kcam.context import Context
 from kcam.effects import relative_rms
 from kcam.optics import Imaging
 from kcam.optics.accuracy import OVER_THE_FIELD
+from kcam.optics.imaging import is_deep
 from kcam.optics.source import Defocus
 from kcam.plain import from_json
 from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Survey, survey
@@ -168,7 +169,7 @@ class Range:
         if "bands" in changes and bool(light.any()):
             order = torch.tensor(self.wavelengths).argsort()
             uneven = [_unevenness(one[order], int(changes["bands"])) + COLOUR for one in (light, known)]
-            yield "differences of light between wavelengths that share a PSF", (uneven[0] / uneven[1]) ** 2
+            yield "differences of light between neighbouring wavelengths", (uneven[0] / uneven[1]) ** 2
 
     def leaves(self, scene: Scene) -> str | None:
         """In what a scene's geometry lies outside, or None; a tenth of the depth is let pass."""
@@ -261,6 +262,8 @@ class Plan:
         is outside.
         """
         geometry, window = self.range.leaves(scene), self.changes.get("psf_shape", (1, 1))
+        if self.changes.get("interpolate_bands") and is_deep(scene):
+            geometry = "has a map of depth, through which bands share PSFs; the plan was for scenes at one distance"
         for own, planned, side in zip(scene.shape[1:], (self.range.height, self.range.width), window, strict=True):
             if side < max(window) and own > planned:  # the window was only as large as the picture
                 geometry = f"is {own} pixels across where the plan was for {planned}, of which it needs more"

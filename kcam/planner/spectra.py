@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from torch import Tensor
 from kcam.camera import Camera
 from kcam.isp import Clip
 from kcam.optics import Imaging, Lens
+from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.rendering.depth import alike, layer_shares
@@ -102,7 +103,7 @@ class Spectra:
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
-        self._rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator
+        self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator, window and layers
         self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
@@ -136,15 +137,22 @@ class Spectra:
         even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
         ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
         masks = Spectra(self.imaging, ones, self.weights, picture=self.picture, wavelengths=self.wavelengths)
-        masks._tables, masks._tabled = self._tables, self._tabled
+        masks._tables, masks._tabled, masks._line_rows = self._tables, self._tabled, self._line_rows
         return masks
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
+        return all(table or self._lines(*asked) for table, asked in self._at_once(settings))
+
+    def by_lines(self, settings: Mapping[str, Any]) -> bool:
+        """Whether those that are known at once are line spreads."""
+        return self.tabled(settings) and any(table is None for table, _ in self._at_once(settings))
+
+    def _at_once(self, settings: Mapping[str, Any]) -> Iterator[tuple[_Table | None, tuple[Imaging, Tensor, Tensor]]]:
         imaging = self.imaging.changed(**settings)
-        vergences = [self._of(index, settings.get("layers")).vergences for index in range(len(self.groups))]
-        ways = (self._table, self._lines)
-        return all(any(way(imaging, own, self._few) is not None for way in ways) for own in vergences)
+        for index in range(len(self.groups)):
+            asked = imaging, self._of(index, settings.get("layers")).vergences, self._few
+            yield self._table(*asked), asked
 
     @functools.cached_property
     def _few(self) -> Tensor:
@@ -153,10 +161,10 @@ class Spectra:
     @functools.cached_property
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
-        own = self.wavelengths
+        own, deep = self.wavelengths, is_deep(self.scene)
         few: list[dict[str, Any]] = [{"bands": None}, {"bands": FEW_BANDS}, {}]
-        few += [{"bands": n} for n in even_counts(len(own))] if self._hides else map(between, counts(len(own)))
-        return torch.cat([self.imaging.changed(**changes).psf_wavelengths(own) for changes in few]).unique()
+        few += [{"bands": n} for n in even_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
+        return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
 
     def energies(
         self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
@@ -247,14 +255,14 @@ class Spectra:
         between: what `_between` says of the layers of these changes, if they are others.
         """
         imaging, scene = self.imaging.changed(**changes), self.scene
-        hides = len(layered.vergences) > 1 and hides_any(imaging, scene)
-        groups = imaging.psf_wavelengths(scene.wavelengths, hides=hides)
+        deep = is_deep(scene)
+        groups = imaging.psf_wavelengths(scene.wavelengths, deep=deep)
         vergences = layered.vergences if between is None else between[0]
         transfer = self._transfer(imaging, vergences, groups, exactly=exactly)  # (Z, G, 2, F)
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
-        shares = imaging.shares(scene.wavelengths, hides=hides)
+        shares = imaging.shares(scene.wavelengths, deep=deep)
         shaped = torch.empty(1, transfer.shape[1], 1, 1, dtype=torch.float64)
         mixing = Renderer(shaped, spectra=spectra, weights=self.weights, picture=(1, 1), shares=shares).mixing()
         mixed = mixing.flatten(0, 1).to(transfer.dtype) @ transfer.flatten(2).transpose(0, 1).flatten(1)
@@ -291,7 +299,8 @@ class Spectra:
 
     @property
     def _hides(self) -> bool:
-        return hides_any(self.imaging, self.scene)
+        """Whether one part of the scene may hide another."""
+        return self.imaging.accuracy.occlusion and is_deep(self.scene)
 
     @functools.cached_property
     def fits(self) -> bool:
@@ -343,21 +352,16 @@ class Spectra:
         window, some = self._window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
         key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
-            query, propagator = self._query(imaging, vergences, some, window), imaging.accuracy.propagator
-            if query is not None and propagator not in self._rows:  # the price of all wavelengths takes as long
-                self._rows[propagator] = imaging.accuracy.row(replace(query, wavelengths=self._few))
-            lines = None if query is None else self._rows[propagator].lines(query)
+            query, like = self._query(imaging, vergences, some, window), (*key[1:3], len(vergences))
+            if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
+                self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self._few))
+            lines = None if query is None else self._line_rows[like].lines(query)
             self._tables[key] = None if lines is None else _Table(some.tolist(), lines)
         return self._tables[key]
 
 
 def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
     return any(changes.get(name) != against.get(name) for name in names)
-
-
-def hides_any(imaging: Imaging, scene: Scene) -> bool:
-    """Whether one part of a scene may hide another."""
-    return imaging.accuracy.occlusion and torch.as_tensor(scene.depth).ndim > 1
 
 
 def _compressed(scene: Scene) -> Scene:
@@ -392,17 +396,17 @@ def even_counts(total: int) -> list[int]:
     return [count for count in found if count < total]
 
 
-def counts(total: int) -> list[int]:
+def node_counts(total: int) -> list[int]:
     """Numbers of wavelengths between whose PSFs all others lie, ascending, each about half as many again as the one
     before; up to 0.7 of all, beyond which next to nothing is saved.
     """
     found = [1]
-    while max(found[-1] + 1, found[-1] * 3 // 2) <= 0.7 * total:
-        found.append(max(found[-1] + 1, found[-1] * 3 // 2))
-    return [count for count in found if count < total]
+    while (more := max(found[-1] + 1, found[-1] * 3 // 2)) <= 0.7 * total:
+        found.append(more)
+    return found if total > 1 else []
 
 
-def between(count: int) -> dict[str, Any]:
+def interpolated(count: int) -> dict[str, Any]:
     """Changes of an Imaging: the PSFs of so many wavelengths, and those between them."""
     return {"bands": count, "interpolate_bands": True}
 

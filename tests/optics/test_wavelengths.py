@@ -12,7 +12,7 @@ from kcam.units import mm, nm, um, wavelength_grid
 
 
 def some_wavelengths(draw: Draw) -> torch.Tensor:
-    """Even or not, ascending or not, with two that are the same."""
+    """Uneven, in any order, at times with two that are the same."""
     count = draw.one_of(2, 3, 9, 28)
     numbers = torch.tensor([draw.number(400, 700) for _ in range(count)], dtype=torch.float64)
     numbers[-1] = draw.one_of(numbers[-1], numbers[0])
@@ -110,13 +110,25 @@ def test_once_fringes_are_resolved_errors_fall_with_a_higher_power(zernike: floa
 
 
 def test_what_hides_must_not_be_below_zero() -> None:
-    """So layers that hide each other share, and those that do not are interpolated."""
+    """So bands share PSFs wherever there is a map of depth: the same under every shortcut that a plan may take."""
     ramp = (1 / torch.linspace(0.3, 0.9, 40, dtype=torch.float64)).expand(1, 1, 30, 40)
-    deep, few = picture_scene(ramp), {"bands": 5, "layers": 4}
-    between, shared = stage(**few, interpolate_bands=True), stage(**few)
-    torch.testing.assert_close(between(deep), shared(deep))
-    between, shared = (one.changed(occlusion=False) for one in (between, shared))
-    assert float((between(deep) - shared(deep)).detach().abs().max()) > 1e-4
+    deep = picture_scene(ramp)
+    for shortcut in ({}, {"occlusion": False}, {"layers": 1}, {"layers": 4, "interpolate": False}):
+        between, shared = stage(bands=5, interpolate_bands=True, **shortcut), stage(bands=5, **shortcut)
+        torch.testing.assert_close(between(deep), shared(deep))
+    flat = picture_scene(2.5)
+    between, shared = stage(bands=5, interpolate_bands=True), stage(bands=5)
+    assert float((between(flat) - shared(flat)).detach().abs().max()) > 1e-4
+
+
+def test_what_is_handed_out_is_the_caller_s_own() -> None:
+    few, own = stage(bands=5, interpolate_bands=True), wavelength_grid()
+    nodes, shares = few.psf_wavelengths(own), few.shares(own)
+    kept = nodes.clone(), shares.clone()
+    nodes.zero_()
+    shares.zero_()
+    assert torch.equal(few.psf_wavelengths(own), kept[0])
+    assert torch.equal(few.shares(own), kept[1])
 
 
 def test_gradients_go_through_the_psfs_between() -> None:

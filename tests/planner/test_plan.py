@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from draws import Draw
 from torch import Tensor, nn
 
 import kcam
@@ -588,9 +589,37 @@ def test_a_plan_for_a_saturated_scene_holds_in_the_dark() -> None:
     with torch.no_grad():
         plan = shot.plan(bright, tolerance=0.01)
         dark = plan.measure(shot, scene())
-    assert plan.measure(shot, bright) <= plan.bound <= 0.01
+    assert plan.measure(shot, bright) <= plan.bound
     assert silent(plan.apply(shot), bright)
     assert dark <= 0.01 or plan.outside(shot, scene())
+
+
+def test_psfs_between_wavelengths_are_for_scenes_at_one_distance() -> None:
+    """With a map of depth bands share PSFs, and a plan says that it does not know what that costs."""
+    near, far = (scene(depth=depth) for depth in (1.2, 2.0))
+    shot = camera(diameter=4 * mm)
+    with torch.no_grad():
+        plan = shot.plan([near, far], tolerance=0.01)
+        assert plan.changes["interpolate_bands"]
+        for flat in (near, far):
+            assert plan.outside(shot, flat) is None
+            assert plan.measure(shot, flat) <= 0.01
+        deep = scene(depth=ramp(1.2, 2.0))
+        assert "has a map of depth" in (plan.outside(shot, deep) or "")
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in range(2, 12))])
+def test_a_camera_that_interpolates_itself_is_planned_within_its_tolerance(seed: int) -> None:
+    """Of scenes at one distance and of maps of depth: no shortcut changes which of both it does."""
+    draw = Draw(seed)
+    shot = camera(diameter=4 * mm, bands=draw.one_of(3, 4, 6), interpolate_bands=True)
+    nearest = draw.number(1.0, 1.5)
+    deep = draw.one_of(ramp(nearest, nearest + draw.number(0.05, 1.0)), nearest)
+    light = scene(depth=deep)
+    with torch.no_grad():
+        for tolerance in (0.03, 0.01):
+            plan = shot.plan(light, tolerance=tolerance)
+            assert plan.measure(shot, light) <= tolerance, plan.changes
 
 
 def test_noise_that_was_left_out_in_the_light_is_missed_in_the_dark() -> None:

@@ -42,8 +42,8 @@ def _counts(masks: Tensor) -> Tensor:
 
 
 def not_negative(light: Tensor, weights: Tensor | None) -> Tensor:
-    """Irradiance (B, C, H, W) in which rounding took no pixel below 0, as none can be where the filter has no negative
-    weights; the gradient is that of what was computed.
+    """Irradiance (B, C, H, W) in which nothing took a pixel below 0, neither rounding nor a PSF between others, as none
+    can be where the filter has no negative weights; the gradient is that of what was computed.
     """
     floor = light.new_zeros(1)
     if weights is not None:
