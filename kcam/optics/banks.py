@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from kcam.cache import value_of
-from kcam.optics.numerics import chebyshev_between, lagrange_weights
 from kcam.optics.source import PixelGrid
+from kcam.optics.wavelengths import chebyshev_wavelengths
 
 _COLOURS = (5, 7, 10, 14, 20)  # wavelengths at which PSFs are computed
 OUTSIDE = 5e-3
@@ -138,9 +138,7 @@ class Banks:
         """So many wavelengths, at most all, and what each gives to those that are asked for."""
         if count >= len(self.wavelengths):
             return self.wavelengths, torch.eye(len(self.wavelengths), dtype=torch.float64)
-        numbers = 1 / self.wavelengths  # fringes are waves of the wave number: as dense in blue as in red
-        nodes = chebyshev_between(*numbers.aminmax(), int(count))
-        return 1 / nodes, lagrange_weights(nodes, numbers)
+        return chebyshev_wavelengths(self.wavelengths, int(count))
 
     def _distinct(
         self, places: Tensor, pixels: PixelGrid, nodes: Tensor, shares: Tensor | None, *, whole: bool

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import lagrange
+from kcam.optics.numerics import chebyshev_between, lagrange, lagrange_weights
 
 _CUBIC = 4  # nodes
 
@@ -22,6 +22,13 @@ def few_wavelengths(wavelengths: Tensor, count: int, *, interpolate: bool) -> tu
     """
     nodes, shares = _few(tuple(wavelengths.tolist()), count, interpolate)
     return torch.tensor(nodes).to(wavelengths), torch.tensor(shares)
+
+
+def chebyshev_wavelengths(wavelengths: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The same by one polynomial through all of them, as PSFs over the field are found, which few resolve."""
+    numbers = 1 / wavelengths
+    nodes = chebyshev_between(*numbers.aminmax(), count)
+    return 1 / nodes, lagrange_weights(nodes, numbers)
 
 
 @functools.lru_cache(maxsize=256)
