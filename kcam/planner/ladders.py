@@ -48,6 +48,9 @@ URGENT = 10.0
 EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
 """Models. What other choices cost is the same in both, to 10 % (of 24 maps of pixels, f/5 to f/50)."""
 
+CANCELLED = {torch.float32: 2e-5, torch.float64: 1e-13}
+"""What is left of a picture's precision where planes of either sign add up to it."""
+
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
@@ -74,6 +77,7 @@ class Ladder:
     fineness of its rungs beyond which they do not.
     off_by: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether it
     is asked once, of the rung below the top: if not even that may do, none is looked at.
+    least: the error that any rung is said to have, of rounding that its pricing does not see.
     doubtful: whether it is left out where its foot saves no time; urgency: how much more its error counts than others'
     where the next ladder to climb is chosen.
     """
@@ -88,6 +92,7 @@ class Ladder:
     settled: float = math.inf
     off_by: float = 1.0
     from_top: bool = False
+    least: float = 0.0
     doubtful: bool = False
     urgency: float = 1.0
     position: int = 0
@@ -152,7 +157,7 @@ class Ladder:
         top = beside | self.levels[-1].changes
         errors = [evaluator.error(beside | level.changes, top, roughly=roughly) for level in candidates]
         best = min(range(len(errors)), key=errors.__getitem__)
-        return candidates[best], errors[best]
+        return candidates[best], max(errors[best], self.least)
 
     def _roughly(self, evaluator: Evaluator, position: int) -> float:
         key = self._key(position)
@@ -351,7 +356,8 @@ def _rank(view: _View) -> Iterator[Ladder]:
     own = view.scene.coefficients.shape[1]
     if view.scene.spectra is None and own > 1:
         levels = [Level(f"rank {rank}", {"rank": rank}, rank) for rank in RANKS if rank < own]
-        yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False}, doubtful=True)
+        least = CANCELLED[view.imaging.working(view.scene).dtype]
+        yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False}, doubtful=True, least=least)
 
 
 def _depth(view: _View) -> Iterator[Ladder]:
