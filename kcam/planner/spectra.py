@@ -50,6 +50,7 @@ WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 
 _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
+_BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
@@ -195,13 +196,14 @@ class Spectra:
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
         exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
+        factor = (1.0 if self.fits else _CUT) * (_BETWEEN if _differ(changes, against, {"interpolate_bands"}) else 1.0)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, against, exactly=exactly) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
             found[0, rows] *= (_HIDDEN if len(layered.vergences) > 1 and self._hides else 1.0) ** 2
-        return found[0] * (1.0 if self.fits else _CUT) ** 2, found[1]
+        return found[0] * factor**2, found[1]
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
