@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random as draws
 
@@ -248,3 +249,17 @@ def test_fast_lengths_are_the_shortest(span: range) -> None:
         candidates = range(math.ceil(least / step) * step, 4 * least + 4, step)
         assert fast_length(least) == next(n for n in candidates if smooth(n))
     assert 10**15 < fast_length(10**15 + 1) < 1.001e15  # by products, not by trying
+
+
+@pytest.mark.parametrize("batch", [1, 10])
+@pytest.mark.parametrize(("factors", "channels"), [(3, 1), (3, 3), (3, 4), (2, 9), (4, 16)])
+def test_fewer_psfs_take_no_more_transforms(factors: int, channels: int, batch: int) -> None:
+    """What is transformed once for a batch, as PSFs are, counts once where a way is chosen."""
+    bands, window, picture = 28, (9, 9), (40, 30)
+    fixed = {"spectra": random(factors, bands, seed=1), "weights": random(channels, bands, seed=2), "picture": picture}
+    counts = []
+    for groups in range(1, bands):
+        shares = torch.nn.functional.one_hot(torch.arange(bands) * groups // bands).double()
+        renderer = Renderer(random(1, groups, *window, seed=3), shares=shares, **fixed)
+        counts.append(renderer.work(batch=batch, coverage=False).operations["transform"])
+    assert all(fewer <= 1.001 * more for fewer, more in itertools.pairwise(counts))

@@ -20,7 +20,7 @@ class Renderer(Bank):
 
     def blur(self, planes: Tensor, *, layer: int) -> Tensor:
         """The scene's planes (B, K, H, W) through the PSFs of one layer: (B, C, H, W)."""
-        return self.in_squares(planes, choose(self).blur(self, self.psfs[layer]))
+        return self.in_squares(planes, choose(self, len(planes)).blur(self, self.psfs[layer]))
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
@@ -42,7 +42,7 @@ class Renderer(Bank):
 
     def work(self, *, batch: int, coverage: bool) -> Work:
         """What one layer of a batch takes, with its coverage or without; of tensors the shapes are enough."""
-        inputs, kernels, products, _, held, touched, contracted = choose(self).takes(self)
+        inputs, kernels, products, *_, held, touched, contracted = choose(self, batch).takes(self)
         points, pixels, kernel = (math.prod(size) for size in (self.sizes.size, self.picture, self.window))
         tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
         if coverage and self.weights is not None:

@@ -126,7 +126,8 @@ class Takes(NamedTuple):
     inputs: int  # transformed
     kernels: int  # transformed
     products: int
-    cost: float  # by which the way is chosen, in transforms; ten products take the time of one
+    cost: float  # of each picture, by which the way is chosen, in transforms; ten products take the time of one
+    once: float  # for a batch
     held: float  # in memory
     touched: float = 0.0
     contracted: float = 0.0  # once for a batch, as kernels are
@@ -141,7 +142,7 @@ class Way(NamedTuple):
 
 def _each_takes(n: Bank) -> Takes:
     held = 4 + n.bands * prod(n.picture) / prod(n.sizes.size)
-    return Takes(n.bands, n.bands, n.bands, cost=0.0 if n.weights is None else inf, held=held)
+    return Takes(n.bands, n.bands, n.bands, cost=0.0 if n.weights is None else inf, once=0.0, held=held)
 
 
 def _each(bank: Bank, psfs: Tensor) -> Blur:
@@ -170,7 +171,8 @@ def _each(bank: Bank, psfs: Tensor) -> Blur:
 def _groups_take(n: Bank) -> Takes:
     parts = n.channels * n.groups
     touched = parts * n.planes * prod(n.picture) / 8
-    return Takes(parts, n.groups, parts, cost=parts + n.groups, held=3 * n.channels + n.groups, touched=touched)
+    held = 3 * n.channels + n.groups
+    return Takes(parts, n.groups, parts, cost=parts, once=n.groups, held=held, touched=touched)
 
 
 def _groups(bank: Bank, psfs: Tensor) -> Blur:
@@ -198,10 +200,12 @@ def _groups(bank: Bank, psfs: Tensor) -> Blur:
 def _kernels_take(n: Bank) -> Takes:
     kernels = n.channels * n.planes
     few = kernels <= n.groups  # measured: the kernels' own contraction runs well
-    cost = (0.0 if few else n.planes + kernels) if n.spectra is not None else inf
+    cost, once = (0.0, 0.0) if few else (n.planes, kernels)
+    if n.spectra is None:
+        cost = inf
     contracted = kernels * n.groups * prod(n.window)
     held = n.planes + kernels + 3 + n.channels
-    return Takes(n.planes, kernels, kernels, cost=cost, held=held, contracted=contracted)
+    return Takes(n.planes, kernels, kernels, cost=cost, once=once, held=held, contracted=contracted)
 
 
 def _kernels(bank: Bank, psfs: Tensor) -> Blur:
@@ -233,9 +237,9 @@ def _kernels(bank: Bank, psfs: Tensor) -> Blur:
 def _bands_take(n: Bank) -> Takes:
     at_once = min(n.bands, n.sizes.bands)
     products = n.bands * (1 + n.channels + (0 if n.spectra is None else n.planes))
-    cost = inf if n.direct else n.planes + n.bands + products / 10
+    cost = inf if n.direct else n.planes + products / 10
     held = (at_once if n.spectra is None else n.planes) + at_once + 2 * n.channels
-    return Takes(n.planes, n.bands, products, cost=cost, held=held)
+    return Takes(n.planes, n.bands, products, cost=cost, once=n.bands, held=held)
 
 
 def _bands(bank: Bank, psfs: Tensor) -> Blur:
@@ -253,6 +257,11 @@ WAYS = {
 }
 
 
-def choose(bank: Bank) -> Way:
-    """The cheapest way; the first of those that cost the same."""
-    return min(WAYS.values(), key=lambda way: way.takes(bank).cost)
+def choose(bank: Bank, batch: int) -> Way:
+    """The cheapest way for so many pictures; the first of those that cost the same."""
+
+    def cost(way: Way) -> float:
+        takes = way.takes(bank)
+        return max(batch, 1) * takes.cost + takes.once
+
+    return min(WAYS.values(), key=cost)
