@@ -147,7 +147,7 @@ class Spectra:
 
     def by_lines(self, settings: Mapping[str, Any]) -> bool:
         """Whether those that are known at once are line spreads."""
-        return self.tabled(settings) and any(table is None for table, _ in self._at_once(settings))
+        return all(table is None and self._lines(*asked) is not None for table, asked in self._at_once(settings))
 
     def _at_once(self, settings: Mapping[str, Any]) -> Iterator[tuple[_Table | None, tuple[Imaging, Tensor, Tensor]]]:
         imaging = self.imaging.changed(**settings)

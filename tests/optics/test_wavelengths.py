@@ -96,7 +96,7 @@ def test_a_picture_is_that_of_its_own_bank(filtered: bool, full_rank: bool) -> N
 
 @pytest.mark.parametrize("zernike", [0.0, 1.0], ids=["a round lens", "aberrated"])
 def test_once_fringes_are_resolved_errors_fall_with_a_higher_power(zernike: float) -> None:
-    """Of a lens of glass, out of focus: with the third and more, where groups have the first."""
+    """Of a lens of glass, out of focus: with the second and more, where groups have the first."""
     scene = picture_scene()
     whole = stage(zernike=zernike)(scene)
 

@@ -23,7 +23,7 @@ from kcam.effects import Work
 from kcam.optics.propagation.row import Propagator
 from kcam.planner import OutOfRange, Plan, Planner, costs, evaluation, noiseless_raw, relative_rms
 from kcam.planner.ladders import even_counts
-from kcam.planner.plan import with_imaging
+from kcam.planner.plan import UNTRIED, with_imaging
 from kcam.units import mm, um, wavelength_grid
 
 
@@ -589,7 +589,7 @@ def test_a_plan_for_a_saturated_scene_holds_in_the_dark() -> None:
     with torch.no_grad():
         plan = shot.plan(bright, tolerance=0.01)
         dark = plan.measure(shot, scene())
-    assert plan.measure(shot, bright) <= plan.bound
+    assert plan.measure(shot, bright) <= plan.bound <= 0.01 / UNTRIED
     assert silent(plan.apply(shot), bright)
     assert dark <= 0.01 or plan.outside(shot, scene())
 
