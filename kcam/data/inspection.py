@@ -173,7 +173,7 @@ def thumbnail(values: np.ndarray, source: Source, *, side: int = 160) -> Tensor:
     light = "D65" if source.unit == "reflectance" else "E"
     weights = spectral.xyz_weights(grid, light)
     colours = torch.einsum("lhw,lc->chw", bands, weights)
-    linear = torch.einsum("rc,chw->rhw", spectral.xyz_to_srgb_matrix().to(colours), colours)
+    linear = spectral.xyz_to_linear_srgb(colours)
     bright = torch.quantile(linear.flatten()[:: max(1, linear.numel() // 100_000)], 0.99).clamp(min=1e-9)
     return tone_curve((linear / bright).clamp(min=0)[None])[0].float()
 
