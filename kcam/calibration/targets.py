@@ -26,6 +26,8 @@ _FAINTEST = 0.2  # of the brightest point's light: what is fainter is a ghost, o
 _LEAST_HALF = 4  # pixels from a point to the edge of its window
 _EDGE_REACH = (8.0, 40.0)  # pixels on either side of an edge that are looked at, at least and at most
 _STRAIGHT = 0.6  # coherence of the gradients of a straight edge; of round points it is 0
+_LEVEL, _NEARLY = 1e-6, 1e-3  # relative: values at one converter's end; noise is more
+_PLATEAU = 3  # pixels that touch: two photon counts may be the same
 
 
 @dataclass(frozen=True)
@@ -245,3 +247,36 @@ def find_edges(pictures: Tensor) -> Targets:
         torch.tensor(starts, dtype=torch.float64),
         reach=reach,
     )
+
+
+def check_saturation(found: Targets, pictures: Tensor) -> None:
+    """ValueError where a target has pixels at 1.0, or a plateau at the highest value, as of black taken off after it.
+
+    Light has no plateau but in pictures without noise: there the pixels around it are alike too, or as bright within
+    a step or two of the converter.
+    """
+    for index, values in enumerate(found.values):
+        used = found.used[index]
+        picture = pictures[int(found.picture[index]), 0].numpy()
+        top = float(picture.max())
+        x, y = (found.origin[index] + torch.stack([found.x[index], found.y[index]], -1)[used]).round().long().T.numpy()
+        labels, _ = scipy.ndimage.label(picture >= top * (1 - _LEVEL), np.ones((3, 3)))
+        most = 0
+        for label in set(labels[y, x].tolist()) - {0} if top > 0 else ():
+            plateau = labels == label
+            around = picture[scipy.ndimage.binary_dilation(plateau, np.ones((3, 3))) & ~plateau]
+            levels = np.unique((around / (top * _LEVEL)).round()) * top * _LEVEL
+            unlike = len(levels) > 4  # more than of a PSF in the middle of four pixels
+            if (
+                plateau.sum() >= _PLATEAU
+                and unlike
+                and top - around.mean() > max(_NEARLY * top, 2 * np.diff(levels).min())
+            ):
+                most = max(most, int(plateau.sum()))
+        full = int(((values >= 1.0) & used).sum())
+        if most or (float(values.max()) == 1.0 and full > 1):
+            x, y = found.origin[index].tolist()
+            raise ValueError(
+                f"{most or full} pixels of the target near x = {x:.0f}, y = {y:.0f} are at {top:.4g}: saturated, so "
+                "that the shape of its peak is lost. Expose at most 0.8 of the full well."
+            )

@@ -14,8 +14,7 @@ from torch import nn
 
 from kcam import Camera, Scene, optics
 from kcam.calibration import PSFFit, fit_psf
-from kcam.calibration.psf import _check_saturation
-from kcam.calibration.targets import find_targets
+from kcam.calibration.targets import check_saturation, find_targets
 from kcam.optics.compound.tracing import trace
 from kcam.units import mm, nm, um
 
@@ -392,7 +391,7 @@ def test_two_photon_counts_that_are_the_same_are_no_plateau() -> None:
         for _ in range(20):
             electrons = math.exp(draws.uniform(math.log(300), math.log(1e5)))
             picture = torch.from_numpy(draws.poisson(electrons * share + 2.0).astype(float))[None, None]
-            _check_saturation(find_targets(picture, kind="points", points=None), picture)
+            check_saturation(find_targets(picture, kind="points", points=None), picture)
 
 
 def test_four_pixels_around_a_point_of_no_noise_are_no_plateau() -> None:
@@ -400,7 +399,7 @@ def test_four_pixels_around_a_point_of_no_noise_are_no_plateau() -> None:
     assert (share > 0.999999 * share.max()).sum() == 4
     for dtype in (torch.float32, torch.float64):
         picture = torch.from_numpy(share).to(dtype).double()[None, None]
-        _check_saturation(find_targets(picture, kind="points", points=None), picture)
+        check_saturation(find_targets(picture, kind="points", points=None), picture)
 
 
 def test_a_wide_peak_in_few_steps_is_no_plateau() -> None:
@@ -408,7 +407,7 @@ def test_a_wide_peak_in_few_steps_is_no_plateau() -> None:
     share = independent.pixel_psf(blurred, wavelength=WAVELENGTH, f_number=20.0, pitch=PITCH / 2, window=61)
     for top in (20, 50, 100, 250):
         picture = torch.from_numpy((share / share.max() * top).round())[None, None]
-        _check_saturation(find_targets(picture, kind="points", points=None), picture)
+        check_saturation(find_targets(picture, kind="points", points=None), picture)
 
 
 def focused() -> optics.Lens:
