@@ -12,29 +12,13 @@ from matplotlib.figure import Figure
 from skimage.color import deltaE_ciede2000, rgb2lab
 from torch import Tensor
 
-from kcam import optics
 from kcam.camera import Camera
 from kcam.inputs import describe
+from kcam.plots.captions import lens_line, where
+from kcam.plots.looks import ZOOM, Look, cut, draw_look, scene_look
 from kcam.plots.pictures import as_image
-from kcam.plots.psf import optics_text
-from kcam.plots.sheet import MUTED, TITLE, Sheet, shortened
-from kcam.plots.stages import (
-    EDGE,
-    GAP,
-    LINE,
-    WIDTH,
-    ZOOM,
-    Look,
-    check_camera,
-    check_zoom,
-    columns_of,
-    cut,
-    draw_lines,
-    draw_look,
-    first_of,
-    scene_look,
-    where,
-)
+from kcam.plots.sheet import EDGE, GAP, LINE, MUTED, TITLE, WIDTH, Sheet, columns_of, draw_lines, shortened
+from kcam.plots.stages import check_camera, check_zoom, first_of
 from kcam.scene import Scene
 
 _STRONGEST = 32  # times that a difference is shown
@@ -156,7 +140,7 @@ def _drawn(
         if name != first:
             lines.append(_numbers(first, own, pictures[first]))
         look = cut(as_image(own), as_image(own), zoom=zoom, across=across)
-        left, top = cell_of(index, name, _lens(cameras[name]), look, lines)
+        left, top = cell_of(index, name, lens_line(cameras[name], otherwise="no lens"), look, lines)
         if name in apart:
             shown = as_image(0.5 + factor * apart[name])
             image = cut(shown, shown, zoom=zoom, across=across).image
@@ -178,8 +162,3 @@ def _numbers(name: str, picture: Tensor, truth: Tensor) -> str:
 
 def _size(picture: Tensor) -> str:
     return f"{picture.shape[-1]} \u00d7 {picture.shape[-2]}"
-
-
-def _lens(camera: Camera) -> str:
-    imaging = next((stage for stage in camera if isinstance(stage, optics.Imaging)), None)
-    return "no lens" if imaging is None else optics_text(imaging)

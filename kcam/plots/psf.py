@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -14,8 +15,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kcam import optics, spectral
+from kcam.optics.source import Points
 from kcam.plots.pictures import light_colours
-from kcam.plots.sheet import INK, LABEL, MUTED, SMALL, TITLE, Sheet, metres, percent_or_more, quiet
+from kcam.plots.sheet import INK, LABEL, MUTED, SMALL, TITLE, Sheet, draw_lines, metres, percent_or_more, quiet
+from kcam.scene import Scene
 from kcam.units import nm, um
 
 
@@ -33,6 +36,8 @@ def _square_root(image: np.ndarray) -> np.ndarray:
     return np.sqrt(image / max(image.max(), 1e-30)) ** (1 / 1.1)
 
 
+_PSF_WAVELENGTHS = (450 * nm, 550 * nm, 650 * nm)
+_LARGEST_PSF = 255  # pixels
 SHARE_SHOWN = 0.97
 """Of the light of each PSF in its window of 255 pixels: what the panels of a PSF figure hold of it at least."""
 CURVE_COLOURS = ("#c8553d", "#1c1c22", "#2a9d8f", "#3f6fd8", "#8f5fbf", "#b8860b")
@@ -232,3 +237,77 @@ def centre(psf: Tensor, reach: int) -> Tensor:
     """
     row, column = (size // 2 for size in psf.shape[-2:])
     return psf[..., row - reach : row + reach + 1, column - reach : column + reach + 1]
+
+
+@dataclass(frozen=True)
+class PSFRow:
+    """PSFs (L,h,w) of a point, as they lie in the picture, at wavelengths (L,) [m]."""
+
+    label: str
+    psfs: Tensor
+    wavelengths: Tensor
+
+
+def psf_rows(imaging: optics.Imaging, scene: Scene) -> list[PSFRow]:
+    """Of the nearest, the middle and the farthest distance; of a lens with a field also in the corner."""
+    if not imaging.accuracy.blur:
+        return []
+    depth = torch.as_tensor(scene.depth).detach().double().cpu().flatten()
+    near, middle, far = float(depth.min()), float(depth.median()), float(depth.max())
+    has_field = imaging.varies or getattr(imaging.lens, "positions", None) is not None
+    chosen = [near, far] if has_field else [near, middle, far]
+    distances = [each for index, each in enumerate(chosen) if metres(each) not in map(metres, chosen[:index])]
+    low, high = (float(end) for end in scene.wavelengths.aminmax())
+    visible = low <= _PSF_WAVELENGTHS[0] and high >= _PSF_WAVELENGTHS[-1]
+    middles = _PSF_WAVELENGTHS if visible else (low, (low + high) / 2, high)
+    wavelengths = torch.tensor(middles, dtype=torch.float64)
+    vergences = 1 / torch.tensor(distances, dtype=torch.float64)
+    shape = imaging.psf_window(wavelengths, vergences=vergences, picture=(scene.shape[1], scene.shape[2]))
+    rows, columns = (min(side, _LARGEST_PSF) | 1 for side in shape)
+    pixels = imaging.pixels((rows, columns), torch.empty(0, device=scene.device))
+    if not has_field:
+        found = imaging.bank(Points(vergences), wavelengths, pixels)
+        labels = [metres(each) for each in distances]
+    else:
+        middle_of = torch.tensor(imaging.centre or (0.0, 0.0), dtype=torch.float64)
+        corner = torch.tensor([scene.shape[2], scene.shape[1]]) / 2 * float(imaging.pixel_pitch)
+        places = torch.stack([middle_of, middle_of + 0.95 * corner])  # upper left: light falls turned about
+        found = _over_field(imaging, places, vergences, wavelengths, pixels)
+        labels = [f"{place},\n{metres(each)}" for each in distances for place in ("middle", "corner")][:3]
+    found = found.double().cpu().flip((-2, -1))
+    return [PSFRow(label, psf, wavelengths) for label, psf in zip(labels, found, strict=False)]
+
+
+def _over_field(imaging: optics.Imaging, places: Tensor, vergences: Tensor, wavelengths: Tensor, pixels: Any) -> Tensor:
+    """PSFs (2 Z, L, h, w) at two places, those of a distance together."""
+    if imaging.varies:
+        lens: Any = imaging.lens
+        reach = float(places.norm(dim=1).max())
+        found = lens.over_field(reach, vergences, wavelengths).bank(places, pixels)
+    else:
+        found = torch.stack(
+            [imaging.bank(Points(vergences, place.expand(len(vergences), 2)), wavelengths, pixels) for place in places]
+        )
+    return found.transpose(0, 1).flatten(0, 1)
+
+
+def draw_psfs(sheet: Sheet, rows: Sequence[PSFRow], left: float, top: float) -> None:
+    """Three of each row, side by side."""
+    sheet.text(left, top, "PSFs of the lens", weight="bold")
+    reach = reach_of(torch.stack([row.psfs for row in rows]), share=SHARE_SHOWN)
+    first, cell, gap = left + 0.75, 1.0, 0.06
+    wavelengths = rows[0].wavelengths
+    for column, colour in enumerate(light_colours(wavelengths)):
+        at = first + column * (cell + gap)
+        sheet.text(
+            at + cell / 2, top + 0.26, f"{wavelengths[column] / nm:.0f} nm", size=SMALL, colour=MUTED, ha="center"
+        )
+        for line, row in enumerate(rows):
+            image = psf_image(centre(row.psfs[column], reach), colour)
+            sheet.picture(image, at, top + 0.46 + line * (cell + gap), cell, cell, smooth=False)
+    for line, row in enumerate(rows):
+        y = top + 0.46 + line * (cell + gap) + cell / 2
+        sheet.text(first - 0.08, y, row.label, size=SMALL, colour=MUTED, ha="right", va="center")
+    below = top + 0.46 + len(rows) * (cell + gap)
+    lines = (f"{2 * reach + 1} pixels across, as they lie in the picture;", "each to its own peak, square root shown")
+    draw_lines(sheet, lines, left, below, 0.75 + 3 * (cell + gap))

@@ -6,6 +6,7 @@ import functools
 import io
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ LABEL = 10.0
 """Size of labels and of the titles of axes [points]."""
 SMALL = 8.5
 """Size of captions and ticks [points]."""
+WIDTH, EDGE, GAP, LINE = 12.8, 0.35, 0.18, 0.165
+"""Of figures in panels: all of it, its rim, between panels, and of a line of a caption [inches]."""
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg")
 """Formats that `save_figure` writes."""
 
@@ -109,6 +112,18 @@ def shortened(text: str, width: float, *, size: float = LABEL, weight: str = "no
     while kept > 0 and wide(f"{text[:kept]}\u2026") > width:
         kept -= 1
     return f"{text[:kept].rstrip(' ,;')}\u2026"
+
+
+def draw_lines(sheet: Sheet, lines: Sequence[str], left: float, top: float, width: float) -> None:
+    """Lines of a caption, each cut off where it would leave its column."""
+    for index, line in enumerate(lines):
+        text = shortened(line, width, size=SMALL)
+        sheet.text(left, top + index * LINE, text, size=SMALL, colour=MUTED, parse_math=False)
+
+
+def columns_of(count: int) -> int:
+    """Four or five, or as many as there are: those that leave the fewest places empty."""
+    return count if count < 4 else min((4, 5), key=lambda columns: (-count % columns, -columns))
 
 
 @functools.lru_cache(4096)  # outlines take milliseconds, and figures of several cameras have most captions in common
