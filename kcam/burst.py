@@ -11,7 +11,7 @@ from torch import Tensor
 from kcam import optics, sensor
 from kcam.camera import Camera
 from kcam.scene import Scene
-from kcam.sensor.noise import check_not_negative
+from kcam.sensor.arguments import check_not_negative
 from kcam.units import as_numbers, check_positive
 
 SEEDS = 2**63 - 1

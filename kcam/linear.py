@@ -19,7 +19,7 @@ from kcam.inputs import describe
 from kcam.optics.linear import LinearImaging, constant_optics
 from kcam.precision import full_precision
 from kcam.scene import Scene
-from kcam.sensor.noise import like
+from kcam.sensor.arguments import like
 from kcam.threads import no_more_than_free
 
 LINEAR = (sensor.Transmission, sensor.ColourFilter, sensor.Motion, sensor.Mosaic, sensor.Exposure)

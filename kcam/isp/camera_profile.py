@@ -16,7 +16,8 @@ from kcam.isp.colour import ColourMatrix, WhiteBalance, as_shot_colour_matrix, a
 from kcam.isp.demosaic import Demosaic
 from kcam.isp.tiff import COLOURED
 from kcam.sensor.adc import ADC
-from kcam.sensor.noise import FixedPattern, RandomStage
+from kcam.sensor.noise import FixedPattern
+from kcam.sensor.random_stage import RandomStage
 
 
 def check_recorded(raw: Any) -> None:

@@ -12,8 +12,8 @@ from kcam import spectral, srgb
 from kcam.cache import is_plain
 from kcam.context import Context, Curves, Stage
 from kcam.inputs import ALPHA, channels_last, check_signal, remedy
+from kcam.sensor.arguments import hold, in_float32, like
 from kcam.sensor.colour_filter import ColourFilter
-from kcam.sensor.noise import hold, in_float32, like
 from kcam.ste import clip_ste
 from kcam.units import as_numbers
 

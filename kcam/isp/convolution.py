@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import remedy
-from kcam.sensor.noise import hold, in_float32
+from kcam.sensor.arguments import hold, in_float32
 
 
 @in_float32

@@ -21,8 +21,8 @@ from kcam.compiled import constant
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal, remedy
 from kcam.isp.colour import as_shot_gains, gains_of
+from kcam.sensor.arguments import hold, in_float32, like
 from kcam.sensor.mosaic import PATTERNS, pattern_tile
-from kcam.sensor.noise import hold, in_float32, like
 
 Tile = tuple[tuple[int, ...], ...]
 RED, GREEN, BLUE = 0, 1, 2

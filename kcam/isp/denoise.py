@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal
 from kcam.isp.colour import as_shot_gains
-from kcam.sensor.noise import check_full_well, check_not_negative, hold, in_float32, like
+from kcam.sensor.arguments import check_full_well, check_not_negative, hold, in_float32, like
 from kcam.units import check_positive
 
 STRIP = 2**16

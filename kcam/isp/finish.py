@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal
-from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.sensor.arguments import check_not_negative, hold, in_float32, like
 from kcam.srgb import LUMINANCE
 from kcam.ste import clip_ste, round_ste
 from kcam.units import check_positive

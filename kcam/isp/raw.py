@@ -20,9 +20,9 @@ from kcam.isp.colour import apply_colour_matrix, tone_curve, white_balance
 from kcam.isp.demosaic import demosaic
 from kcam.isp.tiff import COLOURED, MOST_DN
 from kcam.sensor.adc import ADC, saturation
+from kcam.sensor.arguments import in_float32
 from kcam.sensor.exposure import Exposure
 from kcam.sensor.mosaic import PATTERNS
-from kcam.sensor.noise import in_float32
 from kcam.ste import round_ste
 from kcam.units import as_numbers, check_positive
 

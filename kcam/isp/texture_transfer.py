@@ -27,7 +27,7 @@ from kcam.isp.exemplar import (
 )
 from kcam.isp.film import carried, in_whole_pixels, motions
 from kcam.isp.pieces import lay_pieces, shown_by
-from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.sensor.arguments import check_not_negative, hold, in_float32, like
 from kcam.srgb import LUMINANCE
 from kcam.ste import clip_ste
 from kcam.texture.descent import descend

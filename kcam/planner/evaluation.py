@@ -41,7 +41,7 @@ from kcam.planner.spectra import LINEAR, Spectra, linear
 from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC
-from kcam.sensor.noise import RandomStage
+from kcam.sensor.random_stage import RandomStage
 
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]

@@ -21,7 +21,7 @@ from kcam.planner.ladders import Ladder, ladders
 from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw, shortened
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
-from kcam.sensor.noise import RandomStage
+from kcam.sensor.random_stage import RandomStage
 from kcam.threads import no_more_than_free
 
 WORTH = 0.5

@@ -24,7 +24,7 @@ from kcam.isp import Clip
 from kcam.optics.source import Defocus
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, DarkCurrent, Exposure, ShotNoise
-from kcam.sensor.noise import Mean
+from kcam.sensor.random_stage import Mean
 
 TILE, OCTAVES = 64, 6  # pixels, and their powers of 2
 _STRIP = 2**20  # pixels that are surveyed at once

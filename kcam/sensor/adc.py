@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from kcam.cache import is_plain
 from kcam.context import Context, Stage
-from kcam.sensor.noise import DarkCurrent, ShotNoise, check_not_negative, hold, in_float32, like
+from kcam.sensor.arguments import check_not_negative, hold, in_float32, like
+from kcam.sensor.noise import DarkCurrent, ShotNoise
+from kcam.sensor.random_stage import rms
 from kcam.ste import clip_ste, round_ste
 from kcam.units import check_flag, check_positive
 
@@ -154,8 +156,7 @@ class ADC(Stage):
     def error_if_skipped(self, signal: Tensor, context: Context | None = None) -> float:
         """One step / sqrt(12), relative to the RMS of the signal; see `kcam.effects.Skippable`."""
         step = 1 / ((2**self.bits - 1) * float(torch.as_tensor(self._gain(context)).detach().max()))
-        rms = float(signal.detach().double().square().mean().sqrt()) if signal.numel() else 1.0
-        return step / 12**0.5 / max(rms, 1e-12)
+        return step / 12**0.5 / rms(signal)
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Passes over the signal."""

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from kcam.context import Context
-from kcam.sensor.noise import (
+from kcam.sensor.arguments import (
     MOST_ELECTRONS,
-    RandomStage,
     check_full_well,
     check_not_negative,
     check_seed,
@@ -22,6 +21,7 @@ from kcam.sensor.noise import (
     in_float32,
     like,
 )
+from kcam.sensor.random_stage import RandomStage
 
 
 def _stripes(
@@ -148,12 +148,11 @@ class RowColumnNoise(RandomStage):
 
     def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """The root of the sum of the four variances."""
-        full_well, _ = self._resolve(context, None)
         variances = [
             like(torch.as_tensor(value), signal) ** 2
             for value in (self.row, self.column, self.fixed_row, self.fixed_column)
         ]
-        return torch.stack(torch.broadcast_tensors(*variances)).sum(0).sqrt() / like(full_well, signal)
+        return torch.stack(torch.broadcast_tensors(*variances)).sum(0).sqrt() / like(self._well(context), signal)
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Two sums over the signal; what is drawn is few."""

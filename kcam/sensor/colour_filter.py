@@ -29,8 +29,8 @@ from kcam import spectral
 from kcam.context import Context, Stage
 from kcam.inputs import band_remedy, check_signal, table_remedy
 from kcam.precision import full_precision
+from kcam.sensor.arguments import hold
 from kcam.sensor.mosaic import pattern_tile
-from kcam.sensor.noise import hold
 from kcam.sensor.transmission import Transmission
 from kcam.units import check_flag, check_trained, nm, wavelength_grid
 

@@ -16,8 +16,8 @@ from torch.nn import functional as F
 
 from kcam.context import Context, Stage
 from kcam.effects import relative_change
+from kcam.sensor.arguments import hold, in_float32
 from kcam.sensor.mosaic import at_pixels
-from kcam.sensor.noise import hold, in_float32
 from kcam.units import as_numbers, percent_hint
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcam.context import Context, Stage
 from kcam.effects import relative_change
-from kcam.sensor.noise import (
+from kcam.sensor.arguments import (
     MOST_ELECTRONS,
     check_full_well,
     check_not_negative,

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal
+from kcam.sensor.arguments import hold
 from kcam.sensor.colour_filter import PHOTON_WAVELENGTH, REFERENCE_BANDWIDTH, ColourFilter
-from kcam.sensor.noise import hold
 from kcam.units import as_numbers, check_positive, nm
 
 PLANCK_TIMES_LIGHT = 1.986445857e-25

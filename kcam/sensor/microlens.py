@@ -17,9 +17,9 @@ from kcam.context import Context, Photometric, Stage
 from kcam.effects import relative_change
 from kcam.inputs import check_signal
 from kcam.optics.regions import pixel_positions
+from kcam.sensor.arguments import hold, in_float32
 from kcam.sensor.crosstalk import _numbers
 from kcam.sensor.mosaic import at_pixels
-from kcam.sensor.noise import hold, in_float32
 from kcam.units import IMAGE_SIDE_RANGE, as_numbers, check_length
 
 

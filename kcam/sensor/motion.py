@@ -26,7 +26,7 @@ from kcam.effects import relative_rms
 from kcam.inputs import check_signal
 from kcam.optics.numerics import fast_length
 from kcam.optics.rendering.borders import BORDERS, part
-from kcam.sensor.noise import check_not_negative, hold, in_float32, like
+from kcam.sensor.arguments import check_not_negative, hold, in_float32, like
 from kcam.units import as_numbers, check_positive, check_trained
 
 STEP = 0.5

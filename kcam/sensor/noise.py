@@ -19,140 +19,28 @@ value per picture, (B,1,1,1). float16 and bfloat16 signals are computed in float
 
 from __future__ import annotations
 
-import functools
-import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kcam.cache import is_plain
-from kcam.context import Context, Stage
-from kcam.inputs import check_signal
-from kcam.precision import full_precision
-from kcam.sensor import counting
+from kcam.context import Context
+from kcam.sensor.arguments import (
+    MOST_ELECTRONS,
+    check_full_well,
+    check_not_negative,
+    check_seed,
+    hold,
+    in_float32,
+    like,
+)
+from kcam.sensor.counting import COUNTED as COUNTED
+from kcam.sensor.counting import poisson
+from kcam.sensor.random_stage import Mean as Mean
+from kcam.sensor.random_stage import RandomStage
 from kcam.ste import clip_ste
-from kcam.units import as_numbers, check_positive
-
-
-def hold(stage: nn.Module, **arguments: Any) -> None:
-    """Store a stage's arguments under their own names: a plain tensor as a buffer, everything else as it is."""
-    for name, value in arguments.items():
-        if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
-            stage.register_buffer(name, value)
-        else:
-            setattr(stage, name, value)
-
-
-def like(value: Tensor | float, signal: Tensor) -> Tensor | float:
-    """A number as it is; a tensor or parameter in the signal's dtype, on its device, with its gradient."""
-    return value.to(signal) if isinstance(value, Tensor) else value
-
-
-MOST_ELECTRONS = 1e30
-"""In a full well, or as the spread of a noise: the square still is a float32."""
-COUNTED = 2.0**40
-"""Electrons up to which torch.poisson is right: from 1e14 its variance is off, by 20 % at 1e16, and from 2^63 electrons
-its counts overflow and are negative.
-"""
-
-
-def check_not_negative(value: Tensor | float, *, name: str, unit: str, most: float = math.inf, fix: str = "") -> None:
-    """ValueError unless every element of `value` is finite, >= 0, and not above `most`."""
-    values = as_numbers(value, name=name, expected=f"a number >= 0 {unit}").detach()
-    bad = ~((values >= 0) & values.isfinite())
-    if bad.any():
-        raise ValueError(f"{name} must be finite and >= 0 {unit}, got {values[bad].flatten()[0].item():g}.")
-    if (values > most).any():
-        raise ValueError(f"{name} must be at most {most:g} {unit}, got {values.max().item():g}.{fix and ' '}{fix}")
-
-
-def check_full_well(value: Tensor | float | None) -> None:
-    """ValueError unless every element of a full well is from 1e-3 to 1e30 electrons; None is left to the context."""
-    if value is not None:
-        check_positive(value, name="full_well", unit="electrons")
-        low, high = (float(end) for end in torch.as_tensor(value, dtype=torch.float64).detach().aminmax())
-        if not 1e-3 <= low <= high <= MOST_ELECTRONS:
-            raise ValueError(
-                f"full_well {low if low < 1e-3 else high:g} is outside 0.001..{MOST_ELECTRONS:g} electrons, such as "
-                "10_000."
-            )
-
-
-def check_seed(seed: int) -> None:
-    """TypeError unless the seed that names a sensor is an integer."""
-    if isinstance(seed, bool) or not isinstance(seed, int):
-        raise TypeError(f"seed must be an integer such as 0, got {seed!r}.")
-
-
-def in_float32(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Compute a function of a signal in at least float32 and give the result back in the signal's own dtype."""
-
-    @functools.wraps(function)
-    def wrapper(signal: Tensor, **arguments: Any) -> Tensor:
-        check_signal(signal)
-        working = signal.float() if signal.dtype in (torch.float16, torch.bfloat16) else signal
-        with full_precision(signal.device):
-            return function(working, **arguments).to(signal.dtype)
-
-    return wrapper
-
-
-class _Poisson(torch.autograd.Function):
-    @staticmethod
-    def forward(rate: Tensor, generator: torch.Generator | None) -> Tensor:
-        if counting.can_count(rate):
-            return counting.counts(rate, generator)
-        few = rate.device.type == "cpu" and not torch.compiler.is_compiling() and not (rate > COUNTED).any()
-        counted = rate if few else rate.clamp(max=COUNTED)
-        try:
-            count = torch.poisson(counted, generator=generator)
-        except RuntimeError as error:
-            if not rate.isnan().any():
-                raise
-            raise ValueError(
-                f"the signal has {int(rate.isnan().sum())} values that are NaN: photons cannot be counted. Remove NaN "
-                "where it comes from, or use signal.nan_to_num(0)."
-            ) from error
-        if few:
-            return count
-        # beyond, the deviation has the same size in units of its own sigma
-        return torch.where(rate > COUNTED, rate + (count - counted) * (rate / COUNTED).sqrt(), count)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
-        ctx.save_for_backward(inputs[0], output)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        rate, count = ctx.saved_tensors
-        return grad * (1 + (count - rate) / (2 * rate.clamp(min=1))), None
-
-
-def poisson(electrons: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-    """Count random independent arrivals: an exact Poisson draw, with a gradient to its expectation.
-
-    N ~ Poisson(lambda),   dN/d lambda := 1 + (N - lambda) / (2 max(lambda, 1))
-
-    It is the slope of lambda + sqrt(lambda) e at the e that gives this N, kept finite below one electron. Its mean is
-    exactly 1 at every lambda, so the gradient of any loss linear in N is unbiased.
-
-    Args:      electrons: expected number lambda >= 0, any shape, float32 or float64.
-               generator: source of the draw, on the device of `electrons`; None for torch's default one.
-    Returns:   whole numbers in the dtype of `electrons`. Above 2^40 they are normal: what is left of the Poisson's
-               skewness there is 1e-6.
-
-    Example:
-    >>> electrons = torch.full((400, 400), 100.0, requires_grad=True)
-    >>> counts = sensor.poisson(electrons, generator=torch.Generator().manual_seed(0))
-    >>> counts.mean().backward()
-    >>> counts = counts.detach()
-    >>> round(float(counts.mean())), round(float(counts.std())), round(float(electrons.grad.sum()), 2)
-    (100, 10, 1.0)
-    """
-    return _Poisson.apply(electrons, generator)
-
+from kcam.units import check_positive
 
 OVERFLOWING = 100.0
 """Full wells that overflow with certainty: more give the same, and an infinite rate could not be drawn."""
@@ -318,80 +206,6 @@ def fixed_pattern(
     return signal * (1 + like(prnu, signal) * gain) + offset * (like(dsnu, signal) / like(full_well, signal))
 
 
-def _rms(signal: Tensor) -> float:
-    return max(float(signal.detach().double().square().mean().sqrt()), 1e-12) if signal.numel() else 1.0
-
-
-class Mean(Stage):
-    """A random stage at its mean: it holds that stage, so parameters are shared, and calls its `expected`.
-
-    Example:
-    >>> noise = sensor.ShotNoise(full_well=10_000)
-    >>> sensor.Mean(noise)(torch.tensor([0.25, 1.5])).tolist()  # as expected, up to the full well
-    [0.25, 1.0]
-    """
-
-    def __init__(self, stage: RandomStage):
-        super().__init__()
-        self.stage = stage
-
-    def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
-        """The expected result of the stage."""
-        return self.stage.expected(signal, context)
-
-    def provides(self) -> dict[str, Any]:
-        """What the stage itself provides."""
-        return self.stage.provides()
-
-
-class RandomStage(Stage):
-    """A stage with noise. A subclass draws in `forward`, and gives its mean over all draws in `expected`."""
-
-    full_well: Tensor | float | None
-
-    def expected(self, signal: Tensor, context: Context | None = None) -> Tensor:
-        """The signal without the noise: by default unchanged (noise of zero mean)."""
-        return signal
-
-    def mean(self) -> Mean:
-        """The same stage at its mean, sharing parameters."""
-        return Mean(self)
-
-    def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor | float:
-        """Standard deviation of the noise [share of the full well]: a number, or for each element of the signal."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how large its noise is.")
-
-    def error_if_skipped(self, signal: Tensor, context: Context | None = None) -> float:
-        """RMS of `sigma` relative to the RMS of the signal; see `kcam.effects.Skippable`."""
-        sigma = torch.as_tensor(self.sigma(signal, context)).detach().double()
-        return float(sigma.square().mean().sqrt() / _rms(signal))
-
-    def cost(self, signal: Tensor, context: Context | None = None) -> float:
-        """Passes over the signal: a random number takes some ten of them."""
-        return 10.0
-
-    def reason(self, signal: Tensor, context: Context | None = None) -> str:
-        """How many electrons it is, beside the signal's."""
-        full_well = float(torch.as_tensor(self._resolve(context, None)[0]).detach().max())
-        sigma, level = self.error_if_skipped(signal, context), _rms(signal) * full_well
-        return f"sigma {sigma * level:.3g} of {level:.{0 if level >= 10 else 2}f} electrons"
-
-    def bypass(self) -> Mean:
-        """What stands in for it when it is left out: its mean."""
-        return self.mean()
-
-    def provides(self) -> dict[str, Any]:
-        """The full well, where it was given."""
-        return {} if self.full_well is None else {"full_well": self.full_well}
-
-    def _resolve(
-        self, context: Context | None, generator: torch.Generator | None
-    ) -> tuple[Tensor | float, torch.Generator | None]:
-        context = context or Context()
-        full_well = context.full_well if self.full_well is None else self.full_well
-        return full_well, context.generator if generator is None else generator
-
-
 class ShotNoise(RandomStage):
     """Photon noise and saturation: `shot_noise`. Its mean is the signal clipped at the full well.
 
@@ -426,8 +240,7 @@ class ShotNoise(RandomStage):
 
     def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """sqrt(N) electrons, none above the full well."""
-        full_well, _ = self._resolve(context, None)
-        return (signal.clamp(0, 1) / like(full_well, signal)).sqrt()
+        return (signal.clamp(0, 1) / like(self._well(context), signal)).sqrt()
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
         """Poisson draws take longer than others."""
@@ -465,8 +278,7 @@ class ReadNoise(RandomStage):
 
     def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor | float:
         """sigma_d."""
-        full_well, _ = self._resolve(context, None)
-        return like(self.sigma_electrons, signal) / like(full_well, signal)
+        return like(self.sigma_electrons, signal) / like(self._well(context), signal)
 
     def provides(self) -> dict[str, Any]:
         """The read noise, for the denoising, and what every noise provides."""
@@ -546,12 +358,11 @@ class DarkCurrent(RandomStage):
 
     def expected(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """The signal with the expected dark electrons, clipped at the full well."""
-        full_well, _ = self._resolve(context, None)
-        return _add_mean(signal, electrons=self.electrons(), full_well=full_well)
+        return _add_mean(signal, electrons=self.electrons(), full_well=self._well(context))
 
     def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """The square root of the dark electrons."""
-        full_well, _ = self._resolve(context, None)
+        full_well = self._well(context)
         return torch.as_tensor(_overflowing(self.electrons(), full_well)).sqrt() / torch.as_tensor(full_well)
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
@@ -609,11 +420,10 @@ class FixedPattern(RandomStage):
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """(B,C,H,W) to the same shape: see `fixed_pattern`. It draws nothing, so it takes no generator."""
-        full_well, _ = self._resolve(context, None)
+        full_well = self._well(context)
         return fixed_pattern(signal, prnu=self.prnu, dsnu=self.dsnu, full_well=full_well, seed=self.seed)
 
     def sigma(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """Spread of gain and offset, over many sensors."""
-        full_well, _ = self._resolve(context, None)
-        offset = torch.as_tensor(self.dsnu).to(signal) / like(full_well, signal)
+        offset = torch.as_tensor(self.dsnu).to(signal) / like(self._well(context), signal)
         return torch.hypot(like(self.prnu, signal) * signal, offset.expand_as(signal))

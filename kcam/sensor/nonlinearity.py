@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcam.context import Context, Stage
 from kcam.effects import relative_change
-from kcam.sensor.noise import hold, in_float32
+from kcam.sensor.arguments import hold, in_float32
 from kcam.units import as_numbers
 
 _STEPS = 1001  # between none and a full well, at which a curve is looked at

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcam import spectral
 from kcam.context import Context, Stage
 from kcam.inputs import check_signal, table_remedy
-from kcam.sensor.noise import hold
+from kcam.sensor.arguments import hold
 from kcam.units import check_trained
 
 
