@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import os
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -343,6 +344,12 @@ class Camera(nn.Module):
         Args:      custom: classes of stages that are not kcam's own. No other code is ever run.
         Raises:    FileNotFoundError, ValueError: see `kcam.files.load`.
         """
+        file = Path(path)
+        run = file if file.is_dir() else file.with_suffix("")
+        if not file.is_file() and (run / "checkpoints").is_dir():  # `kcam train` writes the camera last of all
+            raise FileNotFoundError(
+                f"{file} is no camera yet: its training was stopped. Go on with the same kcam train ... --resume."
+            )
         camera = files.load(path, classes=_classes(custom))
         if not isinstance(camera, Camera):
             raise ValueError(f"{path} holds a {type(camera).__name__}, not a Camera.")

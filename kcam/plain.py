@@ -78,7 +78,7 @@ def fitting(value: Any, expected: Any, where: str = "") -> Any:
             if missing or more:
                 what = f"has no {missing[0]!r}" if missing else f"has {more[0]!r}, which it should not have"
                 raise ValueError(f"{place} {what}")
-            found = {key: fitting(value[key], kind, _join(where, key)) for key, kind in kinds.items() if key in value}
+            found = {key: fitting(value[key], kind, join(where, key)) for key, kind in kinds.items() if key in value}
             return expected(**found) if _is_record(expected) else value | found
     elif origin in (list, tuple, Sequence):
         if isinstance(value, (list, tuple)):
@@ -89,7 +89,7 @@ def fitting(value: Any, expected: Any, where: str = "") -> Any:
                 return list(items) if origin is list else tuple(items)
     elif origin in (dict, Mapping):
         if isinstance(value, dict):
-            return {key: fitting(item, inside[1], _join(where, key)) for key, item in value.items()}
+            return {key: fitting(item, inside[1], join(where, key)) for key, item in value.items()}
     elif origin is typing.Literal:
         if value in inside:
             return value
@@ -122,7 +122,8 @@ def _required(expected: Any) -> frozenset[str]:
     return frozenset(f.name for f in dataclasses.fields(expected) if (f.default, f.default_factory) == given)
 
 
-def _join(where: str, key: str) -> str:
+def join(where: str, key: str | int) -> str:
+    """The place of a key within a place."""
     return f"{where}.{key}" if where else str(key)
 
 

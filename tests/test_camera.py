@@ -390,6 +390,13 @@ def test_custom_stage(tmp_path: Path) -> None:
     assert camera[1].weight.item() == 3.0
 
 
+@pytest.mark.parametrize("name", ["painter", "painter.safetensors"])
+def test_a_training_that_was_stopped_is_no_camera_yet(name: str, tmp_path: Path) -> None:
+    (tmp_path / "painter" / "checkpoints").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match=f"{name} is no camera yet: its training was stopped. Go on with"):
+        Camera.load(tmp_path / name)
+
+
 def test_load_something_else(tmp_path: Path) -> None:
     path = tmp_path / "lens.safetensors"
     kcam.camera.files.save(lens(), path, classes=kcam.camera._classes(), version="0")

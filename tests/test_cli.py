@@ -23,7 +23,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import kcam
-from kcam import Camera, cli, demo, files, memory, optics, plots, train
+from kcam import Camera, cli, demo, memory, optics, plots, train
 from kcam.cli import console
 from kcam.optics.compound import presets
 from kcam.scene import read_picture
@@ -431,7 +431,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     def interrupt(descriptor: int) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files.os, "fsync", interrupt)
+    monkeypatch.setattr("os.fsync", interrupt)
     with pytest.raises(KeyboardInterrupt):
         plots.write_picture(torch.ones(3, 4, 5), picture)
     with pytest.raises(KeyboardInterrupt):
