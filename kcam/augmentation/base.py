@@ -32,6 +32,8 @@ _LARGE = 2**20
 """Numbers of a row, a cube's, from which on a CPU rows are given one by one: see `on_drawn_rows`."""
 TOLD = frozenset({"linear", "run", "cube"})
 """What a `CameraSequential` says of where an augmentation stands: nothing that was drawn."""
+LEAST_VERGENCE = 1e-9
+"""1/m: where a distance is asked for, a map's 0 is a million kilometres."""
 TAKES = "(B,C,H,W), a picture in [0,1] or a cube"
 _LEAST, _LARGEST = -0.5, 2.5
 """Of a picture: some beyond 0 and 1 come from other augmentations; from here on it is another scale."""
@@ -127,6 +129,11 @@ def check_inverse_depth(depth: Tensor, signal: Tensor) -> Tensor:
             )
     values = values if values.ndim == 4 else values.reshape(-1, 1, 1, 1).expand(batch, 1, height, width)
     return values.to(signal.device)
+
+
+def finite_vergence(depth: Tensor, signal: Tensor) -> Tensor:
+    """A map of inverse depth that a distance can be made of, float64; errors as `check_inverse_depth`."""
+    return check_inverse_depth(depth, signal).double().clamp(min=LEAST_VERGENCE)
 
 
 class Checked:

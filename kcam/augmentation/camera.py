@@ -12,9 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcam.augmentation.base import CameraAugmentation, each_generator, is_picture, wavelengths_of
+from kcam.augmentation.base import (
+    LEAST_VERGENCE,
+    CameraAugmentation,
+    each_generator,
+    finite_vergence,
+    is_picture,
+    wavelengths_of,
+)
 from kcam.augmentation.distributions import Bounds, Choice, Draw, Seed, Uniform
-from kcam.augmentation.optics import LEAST_VERGENCE, finite_vergence
 from kcam.cache import Settings
 from kcam.camera import PRESETS, Camera
 from kcam.planner.planner import check_tolerance

@@ -18,9 +18,16 @@ from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from torch import Tensor, nn
 
-from kcam.augmentation.base import TAKES, CameraAugmentation, check_layout, check_values, is_picture, wavelengths_of
+from kcam.augmentation.base import (
+    TAKES,
+    CameraAugmentation,
+    check_layout,
+    check_values,
+    finite_vergence,
+    is_picture,
+    wavelengths_of,
+)
 from kcam.augmentation.lens import RandomLens
-from kcam.augmentation.optics import finite_vergence
 from kcam.camera import DEMOSAICING, Camera
 from kcam.context import Context, Stage, applied
 from kcam.inputs import check_array, check_floats
