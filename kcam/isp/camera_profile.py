@@ -99,7 +99,7 @@ def colours(stages: Sequence[nn.Module], context: Context, *, mono: bool, share:
 
 def gain(adc: ADC, context: Context) -> float:
     """That of the converter, or else the camera's."""
-    return float(torch.as_tensor(context.gain if adc.gain is None else adc.gain).detach())
+    return float(torch.as_tensor(adc.gain_in(context)).detach())
 
 
 def noise_profile(

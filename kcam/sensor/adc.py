@@ -77,7 +77,7 @@ def saturation(stages: Iterable[nn.Module], context: Context) -> float:
     converter = next((stage for stage in stages if isinstance(stage, ADC)), None)
     if converter is None or not any(isinstance(stage, (ShotNoise, DarkCurrent)) for stage in stages):
         return 1.0
-    gain, black = converter._gain(context), converter.black_level / (2**converter.bits - 1)
+    gain, black = converter.gain_in(context), converter.black_level / (2**converter.bits - 1)
     return min(1.0, float(torch.as_tensor(gain + black).detach().max()))
 
 
@@ -145,17 +145,18 @@ class ADC(Stage):
             signal,
             bits=self.bits,
             black_level=self.black_level,
-            gain=self._gain(context),
+            gain=self.gain_in(context),
             rounding=self.rounding,
             clamp_black=self.clamp_black,
         )
 
-    def _gain(self, context: Context | None) -> Tensor | float:
+    def gain_in(self, context: Context | None) -> Tensor | float:
+        """Its own gain, or else the camera's."""
         return (context or Context()).gain if self.gain is None else self.gain
 
     def error_if_skipped(self, signal: Tensor, context: Context | None = None) -> float:
         """One step / sqrt(12), relative to the RMS of the signal; see `kcam.effects.Skippable`."""
-        step = 1 / ((2**self.bits - 1) * float(torch.as_tensor(self._gain(context)).detach().max()))
+        step = 1 / ((2**self.bits - 1) * float(torch.as_tensor(self.gain_in(context)).detach().max()))
         return step / 12**0.5 / rms(signal)
 
     def cost(self, signal: Tensor, context: Context | None = None) -> float:
