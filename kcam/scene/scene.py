@@ -1,28 +1,25 @@
-"""Scenes: the light that arrives from every direction and at every wavelength, and how far away it started.
-
-A scene is a cube of spectral radiance. It is stored as bands, or factored: K coefficient planes times K spectra, as
-pictures are (three planes and three spectra stand for 28 bands), and rendering makes use of the factors.
-"""
+"""A cube of spectral radiance with depth, and what it is made from."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral
-from pathlib import Path
 from typing import TypeGuard
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from kcam import spectral, srgb
 from kcam.cache import differentiated
-from kcam.inputs import as_map, as_values, band_remedy, check_bands, check_picture, describe, remedy
+from kcam.inputs import as_map, as_values, band_remedy, check_bands, check_picture, describe
 from kcam.precision import full_precision
+from kcam.scene.builtin import BUILTIN, CHARTS, PHOTOGRAPHS
+from kcam.scene.picture import read_picture
+from kcam.scene.resizing import fitted, target_shape
 from kcam.units import LEAST_DISTANCE, check_distances, check_positive, warn_of_millimetres, wavelength_grid
 
 ROUGH = 1 / 255
@@ -336,7 +333,11 @@ class Scene:
 
         Raises:    ValueError for a size below 1.
         """
-        return _resized(self, target_shape(size, self.shape[1:]))
+        shape = target_shape(size, self.shape[1:])
+        if shape == self.shape[1:]:
+            return self
+        depth = fitted(self.depth, shape, pick=True) if _is_map(self.depth) else self.depth
+        return replace(self, coefficients=fitted(self.coefficients, shape), depth=depth)
 
     def low_rank(self, rank: int) -> Scene:
         """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.
@@ -398,51 +399,6 @@ class Scene:
         )
 
 
-def read_picture(path: str | os.PathLike[str]) -> Tensor:
-    """Read a picture of 8 or 16 bits as it is meant to be seen: (3,H,W) float32 sRGB in [0,1], (1,H,W) if it is grey.
-
-    It is turned as its EXIF orientation says. What is transparent is laid on white. Its values are taken as sRGB: an
-    embedded colour profile is not read.
-
-    Raises:    FileNotFoundError; ValueError for a file that is no picture, damaged or cut short, or holds floats.
-    """
-    from kornia.io import ImageLoadType, load_image
-    from PIL import Image
-
-    if not isinstance(path, (str, os.PathLike)):
-        code = f" What is no file goes to Scene.from_rgb.{remedy(path, name='image')}"
-        raise TypeError(f"path must be the name of a file, got {describe(path)}.{code}")
-    path = Path(path)
-    if not path.is_file():
-        what = f"{path} is a folder" if path.is_dir() else f"there is no file {path}"
-        raise FileNotFoundError(f"{what}. Expected a picture: PNG, JPEG, TIFF, WebP, ...")
-    try:
-        with Image.open(path) as file:
-            if file.format in ("PNG", "TIFF") and ";16" in str(file.tile):
-                # Pillow would cut 16-bit colours to 8 bits; Kornia keeps them, but knows fewer formats.
-                pixels = load_image(path, ImageLoadType.UNCHANGED).float() / 65535
-            elif file.mode in ("F", "I"):
-                raise ValueError("it holds 32-bit values. For linear radiance use Scene.from_bands")
-            else:
-                mode = ("L" if file.mode in ("1", "L", "LA") else "RGB") + "A" * file.has_transparency_data
-                pixels = torch.tensor(np.atleast_3d(np.asarray(file.convert(mode)))).permute(2, 0, 1) / 255
-            orientation = file.getexif().get(0x0112, 1)  # after decoding: Pillow has turned a TIFF by then
-    except Image.DecompressionBombError as error:
-        raise ValueError(
-            f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, more than can be "
-            "photographed in one piece. Make it smaller first."
-        ) from error
-    except Exception as error:  # a damaged header makes Pillow raise anything: SyntaxError, KeyError, struct.error, ...
-        raise ValueError(f"cannot read {path} as a picture of 8 or 16 bits: {error}.") from error
-    if len(pixels) in (2, 4):
-        pixels, alpha = pixels[:-1], pixels[-1:]
-        pixels = pixels * alpha + (1 - alpha)
-    if orientation in (5, 6, 7, 8):
-        pixels = pixels.transpose(1, 2)
-    flips = [axis for axis, cases in ((1, (3, 4, 7, 8)), (2, (2, 3, 6, 7))) if orientation in cases]
-    return pixels.flip(flips)
-
-
 def _check_radiance(planes: Tensor, spectra: Tensor | None) -> None:
     if not planes.numel():
         return
@@ -490,114 +446,3 @@ def _depth_map(depth: float | Sequence[float] | Tensor, planes: Tensor) -> float
 
 def _is_map(depth: float | Tensor) -> TypeGuard[Tensor]:
     return isinstance(depth, Tensor) and depth.ndim == 4
-
-
-def target_shape(size: int | tuple[int, int] | None, shape: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) of what is resized: `size` of the longer side [pixels], or both; ValueError for less than 1."""
-    if size is None:
-        return shape
-    height, width = shape
-    match size:
-        case int() if size >= 1:
-            return max(1, round(size * height / max(shape))), max(1, round(size * width / max(shape)))
-        case (int(height), int(width)) if height >= 1 and width >= 1:
-            return height, width
-    raise ValueError(f"size must be a number of pixels >= 1, or (height, width), got {size!r}.")
-
-
-def _resized(scene: Scene, shape: tuple[int, int]) -> Scene:
-    """`fitted`: colours filtered, distances picked."""
-    if scene.shape[1:] == shape:
-        return scene
-    depth = fitted(scene.depth, shape, pick=True) if _is_map(scene.depth) else scene.depth
-    return replace(scene, coefficients=fitted(scene.coefficients, shape), depth=depth)
-
-
-def fitted(planes: Tensor, shape: tuple[int, int], *, pick: bool = False) -> Tensor:
-    """Planes (B,C,H,W) cropped in their middle to the proportions of `shape`, then resized to it.
-
-    Args:      pick: the nearest pixels, for what has no mean, such as distances; else they are filtered.
-    """
-    height, width = planes.shape[-2:]
-    scale = max(shape[0] / height, shape[1] / width)
-    rows, columns = (max(1, min(n, round(to / scale))) for n, to in ((height, shape[0]), (width, shape[1])))
-    top, left = (height - rows) // 2, (width - columns) // 2
-    planes = planes[..., top : top + rows, left : left + columns]
-    if pick:
-        return F.interpolate(planes, shape, mode="nearest-exact")
-    return F.interpolate(planes, shape, mode="bilinear", antialias=True)
-
-
-def _photograph(name: str) -> Callable[[], tuple[np.ndarray, float | Tensor]]:
-    def read() -> tuple[np.ndarray, float | Tensor]:
-        from skimage import data
-
-        return getattr(data, name)(), 2.0
-
-    return read
-
-
-def _motorcycle() -> tuple[np.ndarray, float | Tensor]:
-    """The left picture, and Z = f b / (d + doffs) with the calibration in scikit-image's docstring.
-
-    The 7 % of the pixels that have no disparity are mostly hidden from the right camera, so they belong to what is
-    behind: they take the farther one of the nearest valid distances to their left and right.
-    """
-    from skimage import data
-
-    picture, _, disparity = data.stereo_motorcycle()
-    focal_length, baseline, offset = 994.978, 0.193001, 31.086  # pixels, m, pixels
-    valid = np.isfinite(disparity)
-    width = disparity.shape[1]
-    column = np.arange(width)
-    before = np.maximum.accumulate(np.where(valid, column, -1), axis=1)
-    after = np.minimum.accumulate(np.where(valid, column, width)[:, ::-1], axis=1)[:, ::-1]
-    padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.inf)  # beyond the borders: nearer than anything
-    disparity = np.minimum(*(np.take_along_axis(padded, index + 1, axis=1) for index in (before, after)))
-    return picture, torch.tensor(focal_length * baseline / (disparity + offset))
-
-
-def _colour_chart(height: int, width: int, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
-    """Four rows of six patches in a black frame: a plane and a reflectance for each patch."""
-    row, row_place = np.divmod((np.arange(height) + 0.5) * 4 / height, 1)
-    column, column_place = np.divmod((np.arange(width) + 0.5) * 6 / width, 1)
-    frame = (np.abs(row_place - 0.5) > 0.42)[:, None] | (np.abs(column_place - 0.5) > 0.42)
-    patch = torch.tensor(np.where(frame, 24, row[:, None] * 6 + column))
-    planes = (patch == torch.arange(25)[:, None, None]).float()
-    black = planes[23] + 0.3 * planes[24]  # the frame is darker than the black patch, so that this one shows
-    return torch.cat([planes[:23], black[None]])[None], spectral.reflectances(wavelengths)
-
-
-def _star(height: int, width: int, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
-    samples = 4
-    y = (torch.arange(height * samples) + 0.5) / samples - height / 2
-    x = (torch.arange(width * samples) + 0.5) / samples - width / 2
-    angle, radius = torch.atan2(y[:, None], x), torch.hypot(y[:, None], x)
-    white = (torch.sin(36 * angle) >= 0) | (radius > 0.48 * min(height, width))
-    return F.avg_pool2d(white.float()[None, None], samples), torch.ones(1, len(wavelengths))
-
-
-def _point_grid(height: int, width: int, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
-    pitch = min(64, height, width)
-    planes = torch.zeros(1, 1, height, width)
-    planes[..., pitch // 2 :: pitch, pitch // 2 :: pitch] = 30.0
-    return planes, torch.ones(1, len(wavelengths))
-
-
-PHOTOGRAPHS: dict[str, Callable[[], tuple[np.ndarray, float | Tensor]]] = {
-    "motorcycle": _motorcycle,
-    "astronaut": _photograph("astronaut"),
-    "coffee": _photograph("coffee"),
-    "chelsea": _photograph("chelsea"),
-}
-"""Name -> a function that gives the picture (H,W,3) in 8 bits, and the depth."""
-
-CHARTS: dict[str, tuple[Callable[[int, int, Tensor], tuple[Tensor, Tensor]], tuple[int, int]]] = {
-    "colour_chart": (_colour_chart, (400, 600)),
-    "star": (_star, (512, 512)),
-    "point_grid": (_point_grid, (512, 512)),
-}
-"""Name -> a function of height, width and wavelengths that draws planes (1,K,H,W) and reflectances (K,L); a shape."""
-
-BUILTIN = (*PHOTOGRAPHS, *CHARTS)
-"""The scenes that `Scene.builtin` knows."""
