@@ -17,8 +17,9 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
+from kcam.planner.band_counts import FEW_BANDS, even_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
-from kcam.planner.spectra import FEW_BANDS, WINDOWS, even_counts, interpolated, node_counts
+from kcam.planner.spectra import WINDOWS
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16

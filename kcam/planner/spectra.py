@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import scipy
 import torch
 from torch import Tensor
 
@@ -30,10 +29,12 @@ from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.source import Points
+from kcam.planner.band_counts import FEW_BANDS, even_counts, interpolated, node_counts
+from kcam.planner.cross_spectra import cross_spectra, rings
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, ShotNoise, Transmission
 from kcam.sensor.mosaic import pattern_tile
-from kcam.sensor.noise import Mean
+from kcam.sensor.random_stage import Mean
 
 LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
 LINEAR |= {"layers", "occlusion"}
@@ -55,10 +56,6 @@ _AROUND = 4  # pixels around the rays of a PSF, within which there is light that
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 1e-4  # of a scene's light, that planes of fewer spectra may leave out
-FEW_BANDS = 3
-"""Wavelengths of the settings beside which a choice is priced."""
-
-_FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings are 1/8 wide below the second, then even
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ class Spectra:
     ) -> None:
         self.imaging, self.scene, self.weights = imaging, scene, weights
         self.picture, self.wavelengths, self.hidden = picture, wavelengths, hidden
-        self.frequencies = _rings()
+        self.frequencies = rings()
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
@@ -220,7 +217,7 @@ class Spectra:
             if shares is not None:
                 planes = (planes[:, :, None] * shares[:, None]).flatten(1, 2)
             dark = imaging.border == "zero"
-            crossed = torch.stack([_crossed(own, self.frequencies, dark=dark) for own in planes])
+            crossed = torch.stack([cross_spectra(own, self.frequencies, dark=dark) for own in planes])
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
 
@@ -384,35 +381,6 @@ def _inside(query: Query) -> bool:
     return float(query.displacement.max()) < (min(query.shape) // 2 - _AROUND) * query.pixel_pitch
 
 
-def even_counts(total: int) -> list[int]:
-    """Numbers of groups, ascending, each about twice the one before; those into which `total` divides evenly first.
-
-    Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are closer to all than 12
-    are, and 14 than 23.
-    """
-    found = [1]
-    while found[-1] < total:
-        near = range(math.ceil(1.5 * found[-1]), math.floor(2.5 * found[-1]) + 1)
-        even = [count for count in near if total % count == 0]
-        found.append(even[-1] if even else 2 * found[-1])
-    return [count for count in found if count < total]
-
-
-def node_counts(total: int) -> list[int]:
-    """Numbers of wavelengths between whose PSFs all others lie, ascending, each about half as many again as the one
-    before; up to 0.7 of all, beyond which next to nothing is saved.
-    """
-    found = [1]
-    while (more := max(found[-1] + 1, found[-1] * 3 // 2)) <= 0.7 * total:
-        found.append(more)
-    return found if total > 1 else []
-
-
-def interpolated(count: int) -> dict[str, Any]:
-    """Changes of an Imaging: the PSFs of so many wavelengths, and those between them."""
-    return {"bands": count, "interpolate_bands": True}
-
-
 def linear(camera: Camera) -> bool:
     """Whether a camera's noiseless raw is linear in light that is not clipped, and its PSF one all over."""
     known = (Clip, ColourFilter, DarkCurrent, Exposure, Imaging, Mosaic, ReadNoise, ShotNoise, Transmission)
@@ -442,42 +410,3 @@ def _recorded(camera: Camera, scene: Scene) -> Tensor | None:
     seen = sizes > _UNSEEN * sizes[-1]
     sums = (sums[:, seen] * sizes[seen].sqrt()).T
     return sums if weights is None else sums @ weights
-
-
-def _rings() -> Tensor:
-    """Frequencies in the middle of rings, (F,) ascending from 0 [cycles per pixel]."""
-    fine = _FINEST * 2 ** (torch.arange(0, 8 * round(math.log2(_FINE / _FINEST)), dtype=torch.float64) / 8)
-    even = torch.arange(_FINE, math.sqrt(0.5) + _STEP, _STEP, dtype=torch.float64)
-    return torch.cat([torch.zeros(1, dtype=torch.float64), fine, even])
-
-
-def _crossed(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
-    """Cross-spectra of planes (K, H, W), mirrored at the borders, or in the dark: (2, F, K, K) of light that runs along
-    x, and y.
-    """
-    height, width = planes.shape[-2:]
-    if dark:
-        found = scipy.fft.rfftn(planes.cpu().numpy(), s=(2 * height, 2 * width), axes=(-2, -1), norm="ortho")
-        spectrum = torch.view_as_real(torch.as_tensor(found))
-    else:
-        spectrum = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
-    order, counts = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
-    parts = spectrum.flatten(1, 2)[:, order].split(counts, dim=1)
-    return torch.stack([part.flatten(1) @ part.flatten(1).T for part in parts]).double().unflatten(0, (2, -1))
-
-
-@functools.lru_cache(maxsize=8)
-@torch.inference_mode(False)
-def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: bool) -> tuple[Tensor, list[int]]:
-    """The order in which a spectrum's frequencies lie in rings, first of light that runs along x, then along y, and how
-    many lie in each.
-    """
-    if dark:
-        fy = torch.fft.fftfreq(2 * height, dtype=torch.float64).abs()
-        fx = torch.fft.rfftfreq(2 * width, dtype=torch.float64)
-    else:
-        fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in (height, width))
-    middles = torch.tensor(frequencies, dtype=torch.float64)
-    ring = torch.bucketize(torch.hypot(fy[:, None], fx).flatten(), (middles[1:] + middles[:-1]) / 2)
-    label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
-    return label.argsort(stable=True), label.bincount(minlength=2 * len(frequencies)).tolist()

@@ -1,0 +1,51 @@
+"""Cross-spectra of planes of light, in rings of frequency."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import scipy
+import torch
+from torch import Tensor
+
+_FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings are 1/8 wide below the second, then even
+
+
+def rings() -> Tensor:
+    """Frequencies in the middle of rings, (F,) ascending from 0 [cycles per pixel]."""
+    fine = _FINEST * 2 ** (torch.arange(0, 8 * round(math.log2(_FINE / _FINEST)), dtype=torch.float64) / 8)
+    even = torch.arange(_FINE, math.sqrt(0.5) + _STEP, _STEP, dtype=torch.float64)
+    return torch.cat([torch.zeros(1, dtype=torch.float64), fine, even])
+
+
+def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
+    """Cross-spectra of planes (K, H, W), mirrored at the borders, or in the dark: (2, F, K, K) of light that runs along
+    x, and y.
+    """
+    height, width = planes.shape[-2:]
+    if dark:
+        found = scipy.fft.rfftn(planes.cpu().numpy(), s=(2 * height, 2 * width), axes=(-2, -1), norm="ortho")
+        spectrum = torch.view_as_real(torch.as_tensor(found))
+    else:
+        spectrum = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
+    order, counts = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
+    parts = spectrum.flatten(1, 2)[:, order].split(counts, dim=1)
+    return torch.stack([part.flatten(1) @ part.flatten(1).T for part in parts]).double().unflatten(0, (2, -1))
+
+
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: bool) -> tuple[Tensor, list[int]]:
+    """The order in which a spectrum's frequencies lie in rings, first of light that runs along x, then along y, and how
+    many lie in each.
+    """
+    if dark:
+        fy = torch.fft.fftfreq(2 * height, dtype=torch.float64).abs()
+        fx = torch.fft.rfftfreq(2 * width, dtype=torch.float64)
+    else:
+        fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in (height, width))
+    middles = torch.tensor(frequencies, dtype=torch.float64)
+    ring = torch.bucketize(torch.hypot(fy[:, None], fx).flatten(), (middles[1:] + middles[:-1]) / 2)
+    label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
+    return label.argsort(stable=True), label.bincount(minlength=2 * len(frequencies)).tolist()
