@@ -152,10 +152,10 @@ def lagrange_weights(nodes: Tensor, at: Tensor) -> Tensor:
 
 
 def lagrange_products(nodes: Tensor, at: Tensor) -> Tensor:
-    """The same without a scale: nodes and values near 1 in size."""
-    off = (at[:, None] - nodes)[:, None, :].expand(-1, len(nodes), -1)
-    own = torch.eye(len(nodes), dtype=torch.bool, device=nodes.device)
-    apart = torch.where(own, 1.0, nodes[:, None] - nodes)
+    """The same without a scale: nodes, (n,) or for each value its own (N, n), and values near 1 in size."""
+    off = (at[:, None] - nodes)[:, None, :].expand(-1, nodes.shape[-1], -1)
+    own = torch.eye(nodes.shape[-1], dtype=torch.bool, device=nodes.device)
+    apart = torch.where(own, 1.0, nodes[..., :, None] - nodes[..., None, :])
     return (torch.where(own, 1.0, off) / apart).prod(-1)
 
 

@@ -8,17 +8,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import chebyshev_between, lagrange, lagrange_weights
+from kcam.optics.numerics import chebyshev_between, lagrange_products, lagrange_weights
 
 _CUBIC = 4  # nodes
+_NEAR = 0.25  # of a step, all that bands may lie beside its middle to be taken for it: of more cubics err more
 
 
 def few_wavelengths(wavelengths: Tensor, count: int, *, interpolate: bool) -> tuple[Tensor, Tensor]:
     """`count` wavelengths (G,) [m], and the share of each of their PSFs in that of a band, (L, G) in float64.
 
-    Interpolated: the middles of equal steps in 1/wavelength, in which fringes are even, and cubics through the four
-    nearest, which go on for half a step at the ends. Else neighbouring bands share the PSF of their group's mean
-    wavelength.
+    Interpolated: the middles of equal steps in 1/wavelength, in which fringes are even, or the bands next to them, and
+    cubics through the four nearest, which go on for half a step at the ends. Else neighbouring bands share the PSF of
+    their group's mean wavelength.
     """
     nodes, shares = _few(tuple(wavelengths.tolist()), count, interpolate)
     return torch.tensor(nodes).to(wavelengths), torch.tensor(shares)
@@ -42,8 +43,12 @@ def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple
         return own @ shares / shares.sum(0), shares
     step = (high - low) / count
     place = (1 / own - low) / step - 0.5
+    nodes, nearest = np.arange(count, dtype=float), np.abs(place - np.arange(count)[:, None]).argmin(1)
+    bands = bool((np.abs(place[nearest] - nodes) <= _NEAR).all())
+    nodes = place[nearest] if bands else nodes
     order = min(count, _CUBIC)
-    first = np.clip(np.floor(place).astype(int) - (order // 2 - 1), 0, count - order)
-    for tap, weight in enumerate(lagrange(place - first, taps=range(order))):
-        shares[np.arange(len(own)), first + tap] = weight
-    return 1 / (low + step * (np.arange(count) + 0.5)), shares
+    first = np.clip(nodes.searchsorted(place) - order // 2, 0, count - order)
+    taps = first[:, None] + np.arange(order)
+    weights = lagrange_products(torch.tensor(nodes[taps]), torch.tensor(place))
+    np.put_along_axis(shares, taps, weights.numpy(), axis=1)
+    return own[nearest] if bands else 1 / (low + step * (nodes + 0.5)), shares

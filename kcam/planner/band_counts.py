@@ -1,12 +1,25 @@
-"""How many wavelengths may stand for all of a scene's."""
+"""How many wavelengths may stand for all of a scene's, and at how many choices are compared."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-FEW_BANDS = 3
+FEW_BANDS = 2
 """Wavelengths of the settings beside which a choice is priced."""
+
+GREY: dict[str, Any] = {"bands": 1}
+"""Light of one wavelength. What a window costs in it, times what line spreads say of a few and of one, is 0.77 to 1.2
+times what it costs in all (5 to 95 % of 55 windows of 20 random pairs).
+"""
+
+GRIDS = 3
+"""Wavelengths at which grids of pupil samples are compared: what a coarse one leaves varies from one to the next."""
+
+ROUND = 4
+"""Wavelengths of round PSFs at which windows are compared: what they cost is then 0.97 to 1.09 times what it is at all
+28; at 2 it is 0.68 to 1.2 times (227 windows of 90 cameras).
+"""
 
 
 def even_counts(total: int) -> list[int]:

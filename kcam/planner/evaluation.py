@@ -40,7 +40,7 @@ from kcam.planner.plan import (
 from kcam.planner.spectra import LINEAR, Spectra, linear
 from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
-from kcam.sensor import ADC
+from kcam.sensor import ADC, ColourFilter, Mosaic, Transmission
 from kcam.sensor.random_stage import RandomStage
 
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
@@ -135,6 +135,18 @@ class Evaluator:
                 )
                 for sample in self.samples
             ]
+            self._compare({name: value for name, value in few.items() if name != "occlusion"})
+
+    def _compare(self, settings: Mapping[str, Any]) -> None:
+        """What spectra say of the light with what was seen of it, where nothing but colours lies between."""
+        between = (Imaging, Transmission, ColourFilter, Mosaic)
+        behind = 1 + max(index for index, stage in enumerate(self.raw_camera) if isinstance(stage, between))
+        if not all(isinstance(stage, between) for stage in list(self.raw_camera)[:behind]):
+            return
+        energies = torch.stack([given[behind][0].double().square().sum().cpu() for given in self.signals])
+        rows = energies.split([len(sample.owners) for sample in self.samples])
+        for spectra, own in zip(self.spectra or (), rows, strict=True):
+            spectra.compare(settings, own)
 
     def _hideable(self, sample: Sample) -> Tensor:
         """See `Spectra`."""

@@ -17,7 +17,7 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
-from kcam.planner.band_counts import FEW_BANDS, even_counts, interpolated, node_counts
+from kcam.planner.band_counts import FEW_BANDS, GREY, GRIDS, ROUND, even_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.planner.spectra import WINDOWS
 from kcam.scene import Scene
@@ -34,13 +34,16 @@ FASTEST = 2.0
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
 
-BY_LINES, BY_ONE = 5.0, 8.0
+BY_LINES, BY_ONE = 5.0, 3.0
 """How many times too large or too small rough errors may be: of the PSF's window by line spreads instead of PSFs, which
-only refuse, and of pupil samples at one wavelength instead of a few. Of 300 random pairs they were 0.18 to 5.5, and
-0.13 to 1.8 times the others.
+only refuse, and of pupil samples at one wavelength instead of a few. Of 300 random pairs they were 0.18 to 5.5 times
+the others, and of 150, where they were above `COARSE`, 0.37 to 3.7 times.
 """
 
-LITTLE = 0.2
+COARSE = 2e-4
+"""Of pupil samples at one wavelength, which may have the same grid either way, where others have not."""
+
+LITTLE = 1 / 3
 """Of the error that there may be, that a rough estimate may be at its largest and be taken."""
 
 URGENT = 10.0
@@ -77,7 +80,8 @@ class Ladder:
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
     off_by: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether it
-    is asked once, of the rung below the top: if not even that may do, none is looked at.
+    is asked once, of the rung below the top: if not even that may do, none is looked at. Others are then priced at one
+    wavelength, and the rough estimate says what more of them add.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     doubtful: whether it is left out where its foot saves no time; urgency: how much more its error counts than others'
     where the next ladder to climb is chosen.
@@ -99,6 +103,7 @@ class Ladder:
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
     roughly: dict[tuple[int, int], float] = field(default_factory=dict)
+    colours: dict[tuple[int, int], float] = field(default_factory=dict)
     compared: set[tuple[int, int]] = field(default_factory=set)
 
     @property
@@ -147,12 +152,25 @@ class Ladder:
             self.errors[key] = 0.0
         elif self.successive:
             self.errors[key] = self._beyond(evaluator)
-        elif self.off_by == 1 or self.from_top or not self._settled(self._roughly(evaluator, self.position), most):
+        elif self.from_top:
+            self.levels[self.position], error = self._best(evaluator, self.position, **GREY)
+            self.errors[key] = error * self._colours(evaluator)
+        elif self.off_by == 1 or not self._settled(self._roughly(evaluator, self.position), most):
             self.levels[self.position], self.errors[key] = self._best(evaluator, self.position)
 
-    def _best(self, evaluator: Evaluator, position: int, *, roughly: bool = False) -> tuple[Level, float]:
-        """Of a rung and its alternatives that with the smallest error."""
-        beside = self.beside | (self.follows.levels[self._followed].changes if self.follows else {})
+    def _colours(self, evaluator: Evaluator) -> float:
+        """By how much an error at one wavelength is too small, roughly, of the rung below the top."""
+        last = len(self.levels) - 2
+        if (key := self._key(last)) not in self.colours:
+            grey = self._best(evaluator, last, roughly=True, **GREY)[1]
+            self.colours[key] = max(1.0, self._roughly(evaluator, last) / grey) if grey else 1.0
+        return self.colours[key]
+
+    def _best(
+        self, evaluator: Evaluator, position: int, *, roughly: bool = False, **settings: Any
+    ) -> tuple[Level, float]:
+        """Of a rung and its alternatives that with the smallest error; settings: beside its own."""
+        beside = self.beside | settings | (self.follows.levels[self._followed].changes if self.follows else {})
         level = self.levels[position]
         candidates = [level] + (self.alternatives(level) if self.alternatives else [])
         top = beside | self.levels[-1].changes
@@ -232,7 +250,7 @@ def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[La
         evaluator.look({})
         return []
     view = _View(evaluator, imaging, scene, one=one)
-    evaluator.look(view.beside)
+    evaluator.look(view.beside | view.coarse)
     return [ladder for make in LADDERS for ladder in make(view)]
 
 
@@ -266,6 +284,16 @@ class _View:
             self.stand_in = PARAXIAL  # no warp, and lines
         self.beside = self.few()
 
+    @property
+    def on_grid(self) -> bool:
+        """Whether how finely the pupil is sampled is a choice."""
+        return self.row is not None and self.row.on_grid and self.imaging.accuracy.samples is None
+
+    @property
+    def coarse(self) -> dict[str, Any]:
+        """The coarsest grid, which does for what only looks at the light."""
+        return {"kappa": KAPPAS[0]} if self.on_grid else {}
+
     def places(self, apart: float) -> tuple[int, int]:
         """Rows and columns of places so far apart at most [pixels]."""
         height, width = self.scene.shape[1:]
@@ -281,11 +309,11 @@ class _View:
         """What the darkest corner has of the light on the axis."""
         return f"down to {self.imaging.illuminated(self.scene):.0%}"
 
-    def few(self, *, bands: bool = True, layers: bool = True, window: bool = True) -> dict[str, Any]:
-        """Cheap settings of the others."""
+    def few(self, *, bands: int = FEW_BANDS, layers: bool = True, window: bool = True) -> dict[str, Any]:
+        """Cheap settings of the others; bands: 0 for all."""
         few = dict(self.stand_in)
-        if bands and self.bands > FEW_BANDS and self.computed:
-            few["bands"] = FEW_BANDS
+        if 0 < bands < self.bands and self.computed:
+            few["bands"] = bands
         if layers and self.layers > FEW_LAYERS:
             few["layers"] = FEW_LAYERS
         core = 2 * (math.ceil(self.blur / self.imaging.pixel_pitch) + TAIL) + 1
@@ -318,17 +346,15 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     """Not under a map of pixels: what a coarse grid makes of it differs from one wavelength to the next, 4 times and
     more, so that a few would not tell.
     """
-    imaging = view.imaging
-    lens = imaging.lens
-    if view.row is None or not isinstance(lens, Lens) or lens.has_pixel_phase:
+    lens = view.imaging.lens
+    if not view.on_grid or not isinstance(lens, Lens) or lens.has_pixel_phase:
         return
-    if not view.row.on_grid or imaging.accuracy.samples is not None:
-        return
-    own = imaging.accuracy.kappa or KAPPA
+    own = view.imaging.accuracy.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
     top = Level(f"kappa {own:g}", {}, own)
-    off_by = BY_ONE if view.one and view.evaluator.certain else 1.0
-    yield Ladder("pupil samples", [*levels, top], view.beside, doubtful=True, off_by=off_by)
+    off_by, least = (BY_ONE, COARSE) if view.one and view.evaluator.certain else (1.0, 0.0)
+    beside = view.few(bands=GRIDS)
+    yield Ladder("pupil samples", [*levels, top], beside, doubtful=True, off_by=off_by, least=least)
 
 
 def _precision(view: _View) -> Iterator[Ladder]:
@@ -340,7 +366,7 @@ def _precision(view: _View) -> Iterator[Ladder]:
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
-    beside = view.few(bands=False)
+    beside = view.few(bands=0)
     successive = view.computed and not view.evaluator.tabled(beside)
     if successive or any(is_deep(scene) for scene in view.evaluator.scenes):
         few: list[dict[str, Any]] = [{"bands": n} for n in even_counts(view.bands)]
@@ -391,9 +417,9 @@ def _support(view: _View) -> Iterator[Ladder]:
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    beside, off_by = view.few(window=False), 1.0
-    if by_lines := view.evaluator.by_lines(beside):
-        off_by = BY_LINES
+    beside, off_by = view.few(window=False), BY_LINES
+    if not (by_lines := view.evaluator.by_lines(beside)):
+        beside, off_by = view.few(window=False, bands=ROUND), 1.0
     levels = [*levels, top]
     yield Ladder("PSF support", levels, beside, alternatives=rescaled, off_by=off_by, from_top=by_lines)
 

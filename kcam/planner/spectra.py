@@ -98,6 +98,7 @@ class Spectra:
         self.picture, self.wavelengths, self.hidden = picture, wavelengths, hidden
         self.frequencies = rings()
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
+        self._unlike = torch.ones(len(scene.coefficients), dtype=torch.float64)  # see `compare`
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
@@ -111,6 +112,14 @@ class Spectra:
         """Those before a camera."""
         recorded, wavelengths = _recorded(camera, scene), scene.wavelengths
         return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths, hidden=hidden)
+
+    def compare(self, settings: Mapping[str, Any], recorded: Tensor) -> None:
+        """Take what pixels truly record with some settings, the energy of each row (B,), for what errors are relative
+        to, where that is less than what spectra say: of a light that falls on pixels which see little of its colour,
+        or of light beyond borders that are not mirrors.
+        """
+        said = self._linear(settings, settings, exactly=True)[1]
+        self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
 
     @functools.cached_property
     def grey(self) -> Spectra:
@@ -160,7 +169,7 @@ class Spectra:
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
         own, deep = self.wavelengths, is_deep(self.scene)
-        few: list[dict[str, Any]] = [{"bands": None}, {"bands": FEW_BANDS}, {}]
+        few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
         few += [{"bands": n} for n in even_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
         return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
 
@@ -171,6 +180,12 @@ class Spectra:
         different layers, where that has the finer ones. roughly: of windows by line spreads, of others at one
         wavelength.
         """
+        off, all_of_it = self._energies(changes, against, roughly=roughly)
+        return off * self._unlike, all_of_it
+
+    def _energies(
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool
+    ) -> tuple[Tensor, Tensor]:
         if roughly and not _differ(changes, against, WINDOW):
             changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
@@ -184,15 +199,16 @@ class Spectra:
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
         """The same of some rows, and of what hides what: tried out."""
         grey = self.grey.scene.samples(rows)
-        changed = (self.imaging.changed(**{**own, "bands": None}) for own in (changes, against))
+        stage = self.grey._cutting(grey, against.get("layers"))
+        changed = (stage.changed(**{**own, "bands": None}) for own in (changes, against))
         ours, theirs = (imaging(grey).double().cpu() for imaging in changed)
         return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
 
     def _linear(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, exactly: bool = False
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
+        exactly = exactly or _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
         factor = (1.0 if self.fits else _CUT) * (_BETWEEN if _differ(changes, against, {"interpolate_bands"}) else 1.0)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
@@ -200,7 +216,16 @@ class Spectra:
             theirs, ours = (self._once(index, layered, own, against, exactly=exactly) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
             found[0, rows] *= (_HIDDEN if len(layered.vergences) > 1 and self._hides else 1.0) ** 2
-        return found[0] * factor**2, found[1]
+        return found[0] * factor**2 * self._alone, found[1]
+
+    @functools.cached_property
+    def _alone(self) -> Tensor:
+        """What the energy of a difference may be, of that in the mean over directions, (B,): more by 1 over the number
+        of lights, if few have most of the energy. Their spectrum is even: it shows the corners of a window.
+        """
+        light = self._light.double().flatten(1).cpu().square()
+        lights = light.sum(1).square() / light.square().sum(1).clamp(min=1e-300)
+        return 1 + 1 / lights.clamp(min=1)
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
@@ -211,7 +236,8 @@ class Spectra:
     def _of(self, index: int, layers: Any) -> _Layered:
         key = index, str(layers)
         if key not in self._layered:
-            scene, imaging = self.groups[index][1], self.imaging.changed(layers=layers)
+            scene = self.groups[index][1]
+            imaging = self._cutting(scene, layers)
             planes = imaging.working(scene)
             vergences, shares = imaging.layers_of(scene, planes)
             if shares is not None:
@@ -220,6 +246,17 @@ class Spectra:
             crossed = torch.stack([cross_spectra(own, self.frequencies, dark=dark) for own in planes])
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
+
+    def _cutting(self, scene: Scene, layers: Any) -> Imaging:
+        """The stage with so many layers, or as many as light of all wavelengths asks for: a few ask for fewer."""
+        imaging, count = self.imaging, len(self.wavelengths)
+        if layers is not None:
+            imaging = imaging.changed(layers=layers)
+        if imaging.accuracy.layers is not None or not is_deep(scene) or len(scene.wavelengths) == count:
+            return imaging
+        whole = replace(scene, spectra=torch.ones(1, count), wavelengths=self.wavelengths, illuminant=torch.ones(count))
+        vergences = imaging.vergences(whole, torch.as_tensor(scene.depth, dtype=torch.float64))
+        return imaging.changed(layers=tuple((1 / vergences).tolist()))
 
     def _once(
         self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], *, exactly: bool
@@ -403,7 +440,7 @@ def _recorded(camera: Camera, scene: Scene) -> Tensor | None:
         elif isinstance(stage, Mosaic):
             tile = pattern_tile(stage.pattern).flatten()
             count = len(scene.wavelengths) if weights is None else len(weights)
-            pairs = tile.bincount(minlength=count).double().diag()
+            pairs = tile.bincount(minlength=count).double().diag() / len(tile)
     if pairs is None:
         return None
     sizes, sums = torch.linalg.eigh(pairs)

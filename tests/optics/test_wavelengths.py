@@ -33,6 +33,24 @@ def test_shares_reproduce_every_cubic(seed: int) -> None:
             torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 9])
+@pytest.mark.parametrize("total", [28, 31, 61])
+def test_nodes_are_bands_where_these_are_dense(total: int, count: int) -> None:
+    """So that what is known of bands, as of a plan's line spreads, is known of them, and theirs are the own PSFs."""
+    own = torch.linspace(400, 720, total, dtype=torch.float64) * nm
+    nodes, shares = few_wavelengths(own, count, interpolate=True)
+    places = [own.tolist().index(node) for node in nodes.tolist()]
+    torch.testing.assert_close(shares[places], torch.eye(count, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_no_share_is_large(seed: int) -> None:
+    """However bands lie: rounding of a PSF is not enlarged, as it were between nodes next to each other."""
+    own = some_wavelengths(Draw(seed))
+    for count in range(1, len(own)):
+        assert float(few_wavelengths(own, count, interpolate=True)[1].abs().sum(1).max()) < 15
+
+
 @pytest.mark.parametrize("seed", range(30))
 def test_groups_share_the_psf_of_their_mean(seed: int) -> None:
     own = some_wavelengths(Draw(seed))

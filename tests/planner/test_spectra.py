@@ -10,12 +10,13 @@ import torch
 from draws import Draw
 
 from benchmarks.planner import random_pair
-from kcam import optics
+from kcam import Camera, Scene, optics, sensor
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
+from kcam.planner.band_counts import even_counts, node_counts
 from kcam.planner.evaluation import Evaluator, _error
-from kcam.planner.ladders import Ladder, Level
-from kcam.planner.spectra import even_counts, node_counts
+from kcam.planner.ladders import LITTLE, Ladder, Level
+from kcam.planner.spectra import Spectra
 from kcam.units import mm, um, wavelength_grid
 
 CHANGES = [
@@ -132,7 +133,7 @@ def test_a_rough_estimate_settles_only_what_it_may(truth: float, off: float) -> 
     assert (ladder.error <= most) == (truth <= most)
     assert ladder.error >= truth
     assert asked[0]
-    assert len(asked) == (1 if 0 < 8 * truth * off <= 0.2 * most or truth * off > 8 * most else 2)
+    assert len(asked) == (1 if 0 < 8 * truth * off <= LITTLE * most or truth * off > 8 * most else 2)
     before = len(asked)
     ladder.price(evaluator, truth)  # for a tolerance at which it is asked more of
     assert ladder.error <= truth or len(asked) == before
@@ -159,6 +160,58 @@ def test_windows_of_which_not_even_the_largest_may_do_are_not_looked_at(last: fl
         assert ladder.level.label == ("65" if looked_at and most == 0.01 else "all")
     assert bool(exactly) == bool(looked_at)
     assert ladder.why() == f"129 would cost {last:g}"
+
+
+@pytest.mark.parametrize(("grey", "factor"), [(0.02, 2.0), (0.08, 1.0), (0.0, 1.0)])
+def test_windows_are_priced_in_grey_and_coloured_by_line_spreads(grey: float, factor: float) -> None:
+    """Which say of the window below the top what all wavelengths cost (0.04), and one: never less than the price."""
+
+    def error(ours: dict, theirs: dict, *, roughly: bool) -> float:
+        assert ours.get("bands") == theirs.get("bands")
+        if not roughly:
+            assert ours["bands"] == 1
+            return 0.5 / ours["psf_shape"][0]
+        return grey if ours["bands"] == 1 else 0.04
+
+    evaluator = SimpleNamespace(error=error)
+    levels = [Level(str(side), {"psf_shape": (side, side)}, side) for side in (5, 129)]
+    ladder = Ladder("PSF support", [*levels, Level("all", {})], {"bands": 2}, off_by=5.0, from_top=True)
+    ladder.price(evaluator, 0.2)
+    assert ladder.error == pytest.approx(0.1 * factor)
+
+
+@pytest.mark.parametrize("own", [None, 5])
+@pytest.mark.parametrize("seed", range(6))
+def test_grey_light_lies_in_the_layers_of_all(seed: int, own: int | None) -> None:
+    """A few wavelengths, without the shortest, would ask for fewer layers than the picture has."""
+    draw = Draw(seed)
+    glass = optics.PlanoConvexLens(25.8 * mm, glass="N-BK7")
+    lens = optics.Lens(optics.CircularAperture(draw.number(2, 6) * mm), glass, focus_distance=draw.number(0.5, 3))
+    ramp = 1 / torch.linspace(draw.number(0.2, 1), draw.number(1.5, 3), 24, dtype=torch.float64)
+    light = Scene.from_rgb(torch.rand(3, 16, 24), depth=ramp.expand(1, 1, 16, 24))
+    imaging = optics.Imaging(lens, pixel_pitch=4 * um, layers=own)
+    spectra = Spectra.of(Camera(imaging), imaging.knowing(light.wavelengths), light, picture=(16, 24))
+    expected, _ = imaging.layers_of(light, light.coefficients)
+    torch.testing.assert_close(spectra.grey._of(0, None).vergences, expected)
+    torch.testing.assert_close(spectra._of(0, None).vergences, expected)
+
+
+@pytest.mark.parametrize("place", [(0, 0), (0, 1), (1, 0), (1, 1)])
+@pytest.mark.parametrize("colour", [(1.0, 0.1, 0.1), (0.1, 1.0, 0.1), (0.1, 0.1, 1.0), (1.0, 1.0, 1.0)])
+def test_one_light_falls_on_pixels_of_one_colour(place: tuple[int, int], colour: tuple[float, ...]) -> None:
+    """Which may see little of it: what a window then costs is much, beside what they record."""
+    glass = optics.PlanoConvexLens(25.8 * mm, glass="N-BK7")
+    lens = optics.Lens(optics.CircularAperture(6.9 * mm), glass, focus_distance=0.36)
+    imaging = optics.Imaging(lens, pixel_pitch=6 * um)
+    camera = Camera(imaging, sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB"))
+    picture = torch.full((3, 64, 64), 1e-4)
+    picture[:, 30 + place[0], 30 + place[1]] = torch.tensor(colour)
+    with torch.no_grad():
+        evaluator = Evaluator(camera, [Scene.from_rgb(picture, depth=0.36)])
+        evaluator.look({"bands": 3})
+        for ours in ({"psf_shape": (17, 17)}, {"psf_shape": (33, 33)}):
+            trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers({}))
+            assert 0.75 < evaluator.error(ours, {}) / trial < 3
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])

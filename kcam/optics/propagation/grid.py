@@ -280,12 +280,11 @@ def _chirp_z_cost(query: Query) -> float:
 
 
 def _fft_cost(query: Query) -> float:
-    total = 0.0
+    # its grid scales with the wavelength, and each grid needs weights of its own
+    total, setup = 0.0, _MAP_SETUP if query.lens.has_pixels else 0.0
     for n, m in _sizes(query):
         length = max(2 * n, m)
-        total += FFT_SLOWNESS * 10 * length**2 * math.log2(length)
-        if query.lens.has_pixels:
-            total += _MAP_SETUP * n**2  # its grid scales with the wavelength, and each grid needs weights of its own
+        total += FFT_SLOWNESS * 10 * length**2 * math.log2(length) + setup * n**2
     return query.vergences.numel() * total
 
 
