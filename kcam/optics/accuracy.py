@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from numbers import Integral
@@ -138,6 +139,11 @@ class Accuracy(Recipe):
     def per_band(self) -> bool:
         """Whether bands are kept apart until the layers of depth are over one another."""
         return self.occlusion and self.coverage == "band"
+
+    @property
+    def node_spacing(self) -> float | None:
+        """Pixels between the nodes of a picture over the field: inf for one PSF, None where the scene tells."""
+        return self.spacing if self.field_variation else math.inf
 
 
 class Shortcuts(TypedDict, total=False):

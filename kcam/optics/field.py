@@ -16,8 +16,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from kcam.optics.accuracy import Accuracy
 from kcam.optics.rendering.borders import part
+from kcam.optics.rendering.depth import Layers
 from kcam.optics.rendering.places import Bank, Between
+from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.resampling import Resampling, multiplied, resampling
 from kcam.optics.rendering.zones import Axis, blend
 from kcam.optics.source import FieldPSFs, PixelGrid
@@ -37,10 +40,6 @@ _SAMPLED = 2**18  # pixels by which a picture's light is known
 _CELLS = ((0.12, 0.09), (0.45, 0.4), (0.68, 0.74), (0.97, 0.94))  # places of the quadrant, of half its sides
 _COLOUR_CELLS = _CELLS[1::2]
 PROBED = 5 * len(_CELLS)  # places whose PSFs are computed to try
-
-Render = Callable[..., Tensor]
-"""Light of PSFs (Z, G, h, w), planes (B, K, H, W) and shares of layers (B, Z, H, W), dark all around; occlusion=False:
-sums over the layers."""
 
 
 @dataclass(frozen=True)
@@ -108,26 +107,17 @@ class _Detail:
 class FieldPicture:
     """How a picture over the field is made.
 
-    psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. render: of one
-    zone. border: see `Imaging`. spacing: pixels between nodes, inf for one PSF, or None. varies, distorts, darkens:
-    whether PSFs do, distortion and relative illumination. whole: the light outside the window is put back into it.
-    mixing: weights (M, L) of what the picture adds up; mixed: render takes these sums. most: bytes of PSFs that are
-    held.
+    psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. renderer: of the
+    picture, whose PSFs are those of each zone. accuracy: what is computed. mixing: weights (M, L) of sums that the
+    renderer takes instead of PSFs.
     """
 
     psfs: FieldPSFs
     pixels: PixelGrid
     centre: tuple[float, float]
-    render: Render
-    border: str
-    spacing: float | None = None
-    varies: bool = True
-    distorts: bool = True
-    darkens: bool = True
-    whole: bool = True
+    renderer: Renderer
+    accuracy: Accuracy
     mixing: Tensor | None = None
-    mixed: bool = False
-    most: float = math.inf
 
     def light(self, planes: Tensor, shares: Tensor | None) -> Tensor:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
@@ -144,17 +134,28 @@ class FieldPicture:
             self.render,
             nodes=(rows, columns),
             window=window,
-            border=self.border,
+            border=self.renderer.border,
             mirrored=self._mirrored,
         )
+
+    def render(
+        self, psfs: Tensor, planes: Tensor, shares: Tensor | None, *, occlusion: bool = True, border: str = "zero"
+    ) -> Tensor:
+        """Light of one zone, of PSFs (Z, G, h, w), planes (B, K, H, W) and shares of layers (B, Z, H, W), dark all
+        around; occlusion=False: sums over the layers.
+        """
+        picture = (planes.shape[-2], planes.shape[-1])
+        layers = Layers(planes, shares, occlusion=occlusion and self.accuracy.occlusion)
+        layers.add(replace(self.renderer, psfs=psfs, picture=picture, border=border, cache=None), first=0)
+        return layers.light
 
     def moved(self, planes: Tensor, shares: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Where distortion brings them, planes times the relative illumination there: nodes share out what is left."""
         picture = (planes.shape[-2], planes.shape[-1])
-        moves = self.distortion(picture) if self.distorts else None
+        moves = self.distortion(picture) if self.accuracy.distortion else None
         if moves is not None:
             planes, shares = moves(planes), None if shares is None else moves(shares)
-        if not self.darkens:
+        if not self.accuracy.relative_illumination:
             return planes, shares
         return multiplied(planes, lambda places: self.psfs.illumination(self._on_sensor(places))), shares
 
@@ -165,13 +166,13 @@ class FieldPicture:
         def ideal(places: Tensor) -> Tensor:
             return (centre - self.psfs.undistorted(self._on_sensor(places))) / self.pixels.pitch
 
-        return resampling(ideal, picture, self.border)
+        return resampling(ideal, picture, self.renderer.border)
 
     def bank(self, places: Tensor, *, colours: float = math.inf) -> Tensor:
         """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
-        own = self._on_sensor(places) if self.varies else torch.zeros_like(places[:1])
-        mixing = self.mixing if self.mixed else None
-        psfs = self.psfs.bank(own, self.pixels, whole=self.whole, mixing=mixing, colours=colours)
+        own = self._on_sensor(places) if self.accuracy.field_variation else torch.zeros_like(places[:1])
+        whole = self.accuracy.renormalise or self.accuracy.psf_shape is None  # light outside is put back
+        psfs = self.psfs.bank(own, self.pixels, whole=whole, mixing=self.mixing, colours=colours)
         psfs = psfs / self.psfs.illumination(own).to(psfs).view(-1, 1, 1, 1, 1)
         return psfs.expand(len(places), *psfs.shape[1:])
 
@@ -186,9 +187,9 @@ class FieldPicture:
             else:
                 rows, columns = len(how.known.rows), len(how.known.columns)
             apart, blending = how.apart, how.blending
-            if self.spacing is not None and math.isinf(self.spacing):  # one PSF on purpose
+            if math.isinf(apart):  # one PSF on purpose
                 apart = max(picture)
-            elif self.spacing is not None:
+            elif self.accuracy.spacing is not None:
                 bank = self._of(how.colours)
                 blending = self._left(self._detail(planes, shares, bank), self._blended(bank, picture, apart))
             deviations = self.psfs.deviations(self.pixels, colours=how.colours)
@@ -222,8 +223,9 @@ class FieldPicture:
         fewest = self.psfs.fewer_colours[:1] or (math.inf,)
         detail = self._detail(planes, shares, self._of(fewest[0]))
         colours, coloured = self._colours(detail, sides)
-        how = _How(probe if self.spacing is None else self.spacing, colours=colours, coloured=coloured)
-        if self.spacing is not None:
+        spacing, most_held = self.accuracy.node_spacing, self.accuracy.max_memory / 2  # bytes of PSFs
+        how = _How(probe if spacing is None else spacing, colours=colours, coloured=coloured)
+        if spacing is not None:
             return how
         bank, rest = self._of(colours), ALLOWED**2 - coloured**2
         places, most = 2.0 * probe, BETWEEN * ALLOWED
@@ -235,12 +237,12 @@ class FieldPicture:
             if off <= most:
                 return replace(how, apart=apart, blending=error, known=known, between=off)
             closer = 0.9 * (most / off) ** 0.25  # of fourth order, with something to spare
-            if closer * places < apart or known.psfs.nbytes / closer**2 > self.most:
+            if closer * places < apart or known.psfs.nbytes / closer**2 > most_held:
                 break
             places *= closer
         error = self._left(detail, self._blended(bank, sides, probe))
         apart, better = _apart(SHARED * error, probe, allowed=math.sqrt(rest))
-        if known.psfs.nbytes * (places / apart) ** 2 < self.most:
+        if known.psfs.nbytes * (places / apart) ** 2 < most_held:
             known = Between.known(bank, sides, apart=apart, mirrored=self._mirrored)
             return replace(how, apart=apart, blending=better, known=known)
         apart, error = _apart(error, probe, allowed=math.sqrt(rest))
@@ -289,7 +291,7 @@ class FieldPicture:
         """One of the patches, row and column, with as much around it as the window reaches."""
         for dim, index, m in zip((-2, -1), place, self.pixels.shape, strict=True):
             start, stop = index * _PATCH, min((index + 1) * _PATCH, planes.shape[dim])
-            planes = part(planes, start - m // 2, stop + (m - 1) // 2, self.border, dim=dim)
+            planes = part(planes, start - m // 2, stop + (m - 1) // 2, self.renderer.border, dim=dim)
         return planes
 
     @torch.no_grad()

@@ -9,30 +9,29 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import Any, Protocol, Unpack
 
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, differentiated, has_derivative
+from kcam.cache import ValueCache, has_derivative
 from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
 from kcam.optics.accuracy import OVER_THE_FIELD, Accuracy, Recipe, Shortcuts
 from kcam.optics.banks import KnownPSFs
-from kcam.optics.field import PROBE, PROBED, FieldEstimate, FieldPicture
+from kcam.optics.field import FieldEstimate, FieldPicture
 from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
-from kcam.optics.regions import field_shares, pixel_positions
+from kcam.optics.regions import zones
 from kcam.optics.rendering.borders import BORDERS
-from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, few_values, layer_shares, present, warn_of_few
+from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, layer_shares, layer_vergences, present, warn_of_few
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
-from kcam.optics.rendering.zones import Axis
 from kcam.optics.source import Defocus, FieldPSFs, PixelGrid, Points, PSFSource, is_field_source, is_source
 from kcam.optics.wavelengths import few_wavelengths
+from kcam.optics.work import PictureWork
 from kcam.precision import full_precision
 from kcam.scene import Scene
 from kcam.threads import no_more_than_free
@@ -43,7 +42,6 @@ _SETTINGS = _DEFAULT.settings().keys()
 _SHORTCUTS = _SETTINGS - {field.name for field in fields(Recipe)}
 _FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
 _TRACED = 4  # lenses, at some vergences and wavelengths, whose pupils are kept
-_FEW_COLOURS, _COLOURS = 5, 12  # PSFs of more wavelengths are polynomials of those of some: that many, about
 
 
 class Absorber(Curves, Protocol):
@@ -264,13 +262,12 @@ class Imaging(Stage):
         if self.accuracy.psf_shape is not None:
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
-        if not self.varies:
-            asked = (vergences, wavelengths, pixels)
-            find = functools.partial(self.lens.window, Points(vergences), wavelengths, pixels)
-            if self.known is None:
-                return _within(self._window_cache.get((self.lens, *asked), find), picture)
-            return _within(self.known.window(*asked, find), picture)
-        return _within(self._traced(picture, vergences, wavelengths).window(pixels), picture)
+        if self.varies:
+            return _within(self._traced(picture, vergences, wavelengths).window(pixels), picture)
+        find = functools.partial(self.lens.window, Points(vergences), wavelengths, pixels)
+        if self.known is not None:
+            return _within(self.known.window(vergences, wavelengths, pixels, find), picture)
+        return _within(self._window_cache.get((self.lens, vergences, wavelengths, pixels), find), picture)
 
     def depth_layers(self, depth: Tensor, wavelengths: Tensor, *, waves: float = LAYER_WAVES) -> Tensor:
         """Vergences of the layers that a depth map is cut into, ascending (Z,) [1/m].
@@ -283,28 +280,12 @@ class Imaging(Stage):
         vergence = 1 / depth.to(torch.float64)
         if not self.accuracy.blur:
             return vergence.flatten()[:1]
-        if vergence.ndim == 1 and len(vergence) > 1:
-            return vergence.unique()
-        low, high = vergence.min(), vergence.max()
-        span = float((high - low).detach())
-        if span == 0:
-            return vergence.mean()[None] if differentiated(vergence) else low[None]
-        count = self.accuracy.layers
-        if not isinstance(count, int | None):
-            return 1 / torch.as_tensor(count, dtype=torch.float64, device=vergence.device)
-        nodes = getattr(self.lens, "vergences", None)
-        if nodes is not None and count is None:  # between them PSFs are linear, as shares of layers are
-            nodes = nodes.to(vergence.device)
-            return torch.cat([low[None], nodes[(nodes > low.detach()) & (nodes < high.detach())], high[None]])
-        if count is None:
-            count = 1 + math.ceil(span * self.lens.defocus_waves(wavelengths) / waves)
-            own = None if differentiated(vergence) else few_values(vergence, at_most=count)
-            if own is not None:
-                return own
-        if count == 1:
-            return (low + high)[None] / 2
-        share = torch.linspace(0, 1, count, dtype=torch.float64, device=vergence.device)
-        return low + (high - low) * share
+        return layer_vergences(
+            vergence,
+            self.accuracy.layers,
+            known=getattr(self.lens, "vergences", None),
+            steps=lambda span: span * self.lens.defocus_waves(wavelengths) / waves,
+        )
 
     # ---- scene and optics ------------------------------------------------------------------------------------------
 
@@ -354,8 +335,8 @@ class Imaging(Stage):
         """PSFs of the bands of a scene at one distance, (Z, L, h, w) in the dtype and on the device of `like`; kept
         while nothing changes. The caller's own: it may be changed in place.
         """
-        psfs = self._grouped_bank(wavelengths, points=Points(vergences), shape=shape, like=like)
-        shares = self.shares(wavelengths)
+        nodes, shares = self._few(wavelengths, deep=False)
+        psfs = self._grouped_bank(nodes, points=Points(vergences), shape=shape, like=like)
         with full_precision(psfs.device):
             return psfs.clone() if shares is None else torch.einsum("lg,zghw->zlhw", shares.to(psfs), psfs)
 
@@ -374,13 +355,13 @@ class Imaging(Stage):
         """What each of these PSFs gives to each band, (L, G); None where each band has its own."""
         return self._few(wavelengths, deep=deep)[1]
 
-    def _grouped_bank(
-        self, wavelengths: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor, deep: bool = False
-    ) -> Tensor:
-        """PSFs from which the bands take theirs, (Z, G, h, w)."""
+    def _colours(self, scene: Scene) -> tuple[Tensor, Tensor | None]:
+        return self._few(scene.wavelengths, deep=is_deep(scene))
+
+    def _grouped_bank(self, nodes: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor) -> Tensor:
+        """PSFs at wavelengths (G,), from which the bands take theirs, (Z, G, h, w)."""
         if not self.accuracy.blur:
             return like.new_ones(len(points.vergences), 1, 1, 1)
-        nodes = self.psf_wavelengths(wavelengths, deep=deep)
 
         def build() -> Tensor:
             pixels = self.pixels(shape, like)
@@ -432,10 +413,6 @@ class Imaging(Stage):
             return vergences
         return vergences[present(1 / depth, vergences, interpolate=self.accuracy.interpolate).to(vergences.device)]
 
-    def _layers_at_once(self, bands: int, window: tuple[int, int], planes: Tensor) -> int:
-        """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
-        return max(1, int(self.accuracy.max_memory / 4 // (bands * window[0] * window[1] * planes.element_size())))
-
     def work(
         self,
         scene: Scene,
@@ -452,123 +429,50 @@ class Imaging(Stage):
             works = [self.work(scene.samples(rows), channels=channels, apart=apart) for rows in groups_of]
             return sum(works[1:], works[0])
         planes, vergences = (self.working(scene), self.filled(scene)) if known is None else known
-        batch, count, height, width = planes.shape
-        bands, factored = scene.wavelengths.numel(), scene.spectra is not None
-        first, rank = Work(), self.accuracy.rank
-        if rank is not None and rank < count:
-            touched = float(batch * height * width * count * (count / 8 + rank))
-            first, count, factored = Work({"touch": touched}, planes.element_size() * touched / count), rank, True
-        window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
-        layers, itemsize = vergences.numel(), planes.element_size()
+        picture, wavelengths, layers = scene.shape[1:], scene.wavelengths, len(vergences)
+        window = self.psf_window(wavelengths, vergences=vergences, picture=picture)
+        shapes = planes.new_empty(0, device="meta")
         channels = None if layers > 1 and self.accuracy.per_band else channels
-        grouped = self.psf_wavelengths(scene.wavelengths)
-        groups = len(grouped)
+        weights = None if channels is None else shapes.new_empty(channels, len(wavelengths))
+        renderer = self._renderer(scene, window, weights=weights, like=shapes)
+        own, pixels = PictureWork(planes, renderer, layers, self.accuracy), self.pixels(window, planes)
         if self.varies:
-            psfs = self._traced((height, width), vergences, scene.wavelengths)
-            psf = {"field psf": float(layers), "field point": layers * psfs.points(self.pixels(window, planes))}
-            return first + self._field_work(scene, planes, (count, channels), window=window, psf=psf, apart=apart)
-        shaped = functools.partial(planes.new_empty, device="meta")
-        renderer = Renderer(
-            shaped(1, groups, *window),
-            spectra=shaped(count, bands) if factored else None,
-            weights=None if channels is None else shaped(channels, bands),
-            **self._rendering(scene),
-        )
-        rendering = renderer.work(batch=batch, coverage=layers > 1 and self.accuracy.occlusion)
-        scale = itemsize / 4  # twice as many bytes take twice as long
-        operations = {kind: number * layers * scale for kind, number in rendering.operations.items()}
-        operations["layer"] = float(layers)
-        bank = 0.0
-        if self.accuracy.blur:
-            at_once = min(layers, self._layers_at_once(bands, window, planes))
-            banks = math.ceil(layers / at_once)  # at each wavelength all layers are found together
-            operations |= {"bank": float(banks), "psf": float(banks * groups)}
-            if isinstance(self.lens, Lens) and not self.varies:
-                pixels = self.pixels(window, planes)
-                operations |= self.lens.operations(Points(vergences), grouped, pixels, self.accuracy)
-            bank = float(2 * at_once * groups * window[0] * window[1] * itemsize)
-        shares = float(layers * height * width * batch * 16) if layers > 1 else 0.0
-        zones = 1 if self._positions is None else len(self._positions)
-        operations = {kind: count * zones for kind, count in operations.items()}
-        return first + Work(operations, rendering.memory + bank + shares)
-
-    def _field_work(
-        self,
-        scene: Scene,
-        planes: Tensor,
-        sizes: tuple[int, int | None],
-        *,
-        window: tuple[int, int],
-        psf: dict[str, float],
-        apart: int | None,
-    ) -> Work:
-        """That of one distance, over the field: PSFs of places, each of which takes `psf`, and zones. Where the places
-        follow from the scene those count too at which that is tried. sizes: planes of the scene, and channels.
-        """
-        (count, channels), layers = sizes, int(psf["field psf"])
-        picture, own, bands = (scene.shape[-2], scene.shape[-1]), self.accuracy, len(scene.wavelengths)
-        spacing = (own.spacing or apart or PROBE) if own.field_variation else math.inf
-        nodes = [len(Axis.of(n, m, apart=spacing).nodes) for n, m in zip(picture, window, strict=True)]
-        zones = math.prod(nodes)
-        places = float(zones if self.centre else math.prod((n + 1) // 2 for n in nodes))  # others mirror these
-        tried = 0 if own.spacing is not None or not own.field_variation else PROBED
-        groups = len(self.psf_wavelengths(scene.wavelengths))
-        computed = float(min(groups, _COLOURS))
-        colours = 4.0 * (2 * groups) if groups > _FEW_COLOURS else 0.0
-        sides = [min(n, math.ceil(2 * n / max(1, k - 1))) for n, k in zip(picture, nodes, strict=True)]
-        shaped = functools.partial(planes.new_empty, device="meta")
-        factored = scene.spectra is not None or count < planes.shape[1]
-        border = "dark" if layers == 1 else "zero"
-        rendering = self._rendering(scene) | {"border": border, "picture": (sides[0], sides[1]), "cache": None}
-        renderer = Renderer(
-            shaped(1, groups, *window),
-            spectra=shaped(count, bands) if factored else None,
-            weights=None if channels is None else shaped(channels, bands),
-            **rendering,
-        )
-        batch, scale = len(planes), planes.element_size() / 4
-        zone = renderer.work(batch=batch, coverage=layers > 1 and own.occlusion)
-        operations = {kind: n * layers * scale * (zones + tried) for kind, n in zone.operations.items()}
-        operations |= {"field": 1.0, "layer": float(layers * zones)}
-        operations |= {kind: number * ((places + tried) * computed + colours) for kind, number in psf.items()}
-        operations["touch"] += 60.0 * planes.numel() * (own.distortion + 0.1 * own.relative_illumination)
-        held = float(2 * nodes[1] * layers * groups * window[0] * window[1] * planes.element_size())
-        shares = float(layers * picture[0] * picture[1] * batch * 16) if layers > 1 else 0.0
-        return Work(operations, zone.memory + held + shares)
+            points = self._traced(picture, vergences, wavelengths).points(pixels)
+            return own.over_field(points, apart=apart, mirrored=self.centre is None)
+        psfs = {}
+        if isinstance(self.lens, Lens) and self.accuracy.blur:
+            psfs = self.lens.operations(Points(vergences), self.psf_wavelengths(wavelengths), pixels, self.accuracy)
+        return own.on_axis(psfs, zones=1 if self._positions is None else len(self._positions))
 
     # ---- rendering -------------------------------------------------------------------------------------------------
 
     def _render(self, scene: Scene, planes: Tensor, contraction: Tensor | None) -> Tensor:
         batch, _, height, width = planes.shape
-        bands = scene.wavelengths.numel()
-        channels = bands if contraction is None else contraction.shape[0]
         if planes.numel() == 0:
+            channels = scene.wavelengths.numel() if contraction is None else contraction.shape[0]
             return planes.new_zeros(batch, channels, height, width) + planes.sum()
         if len(groups := alike(scene)) > 1:
             parts = [self._render(scene.samples(rows), planes[rows], contraction) for rows in groups]
             return torch.cat(parts)[torch.cat(groups).argsort().to(planes.device)]
-        spectra = None if scene.spectra is None else scene.spectra.to(planes)
         weights = None if contraction is None else contraction.to(planes)
         vergences, shares = self.layers_of(scene, planes)
-        afterwards = None
-        if shares is not None and self.accuracy.per_band:
-            weights, afterwards = None, weights
+        late = shares is not None and self.accuracy.per_band
+        weights, afterwards = (None, weights) if late else (weights, None)
         if self.varies:
-            learns = has_derivative((self.lens, planes, shares, spectra, vergences, weights))
+            learns = has_derivative((self.lens, planes, shares, scene.spectra, vergences, weights))
             with torch.set_grad_enabled(learns and torch.is_grad_enabled()):  # else nothing is to be kept for it
                 field = self._field_picture(scene, vergences=vergences, weights=weights, like=planes)
                 light = field.light(planes, shares)
             return self._finished(light, weights, afterwards)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
-        length = self._layers_at_once(bands, window, planes)
-        light, rendering, deep = planes.new_zeros(()), self._rendering(scene), is_deep(scene)
-        for position, own in self._zones(planes):
+        renderer = self._renderer(scene, window, weights=weights, like=planes)
+        light, nodes, length = planes.new_zeros(()), self._colours(scene)[0], renderer.at_once
+        for position, own in zones(planes, self._positions, pixel_pitch=self.pixel_pitch):
             layers = Layers(own, shares, occlusion=self.accuracy.occlusion)
-            for start in range(0, vergences.numel(), length):
+            for start in range(0, len(vergences), length):
                 points = Points(vergences[start : start + length], position)
-                psfs = self._grouped_bank(scene.wavelengths, points=points, shape=window, like=planes, deep=deep)
-                renderer = Renderer(psfs, spectra=spectra, weights=weights, **rendering)
-                layers.add(renderer, first=start)
+                psfs = self._grouped_bank(nodes, points=points, shape=window, like=planes)
+                layers.add(replace(renderer, psfs=psfs), first=start)
             light = layers.light if position is None else light + layers.light
         return self._finished(light, weights, afterwards)
 
@@ -576,6 +480,14 @@ class Imaging(Stage):
         if afterwards is not None:
             light, weights = torch.einsum("cl,blyx->bcyx", afterwards, light), afterwards
         return not_negative(light, weights)
+
+    def _renderer(self, scene: Scene, window: tuple[int, int], *, weights: Tensor | None, like: Tensor) -> Renderer:
+        """How a picture is convolved, with PSFs of which there are the sizes alone."""
+        nodes, shares = self._colours(scene)
+        psfs, spectra = like.new_empty(1).expand(1, len(nodes), *window), scene.spectra
+        own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
+        own |= {"border": self.border, "picture": scene.shape[1:], "shares": shares, "cache": self._transfer_cache}
+        return Renderer(psfs, spectra=None if spectra is None else spectra.to(like), weights=weights, **own)
 
     # ---- over the field --------------------------------------------------------------------------------------------
 
@@ -615,8 +527,7 @@ class Imaging(Stage):
             found = self._traced(picture, vergences, wavelengths) if traced is None else traced
             return found.at_wavelengths(grouped, lateral_colour=lateral)
 
-        key = (self.lens, corner, vergences, wavelengths, grouped, lateral)
-        return self._field_cache.get(key, build)
+        return self._field_cache.get((self.lens, corner, vergences, wavelengths, grouped, lateral), build)
 
     def _traced(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """Those of all wavelengths, which the groups of any number take theirs from."""
@@ -628,56 +539,15 @@ class Imaging(Stage):
         )
 
     def _field_picture(self, scene: Scene, *, vergences: Tensor, weights: Tensor | None, like: Tensor) -> FieldPicture:
-        picture = (scene.shape[-2], scene.shape[-1])
-        traced = self._traced(picture, vergences, scene.wavelengths)
+        picture, wavelengths = scene.shape[1:], scene.wavelengths
+        traced = self._traced(picture, vergences, wavelengths)
         window = self.accuracy.psf_shape or _within(traced.window(self.pixels((1, 1), like)), picture)
-        spectra = None if scene.spectra is None else scene.spectra.to(like)
-        rendering = self._rendering(scene) | {"border": "zero", "cache": None, "weights": weights, "spectra": spectra}
-        mixing, mixed = None, False
-        if weights is not None:
-            groups = len(self.psf_wavelengths(scene.wavelengths))
-            sums = Renderer(like.new_empty(1, groups, 1, 1), **rendering).mixing()
-            channels, count = sums.shape[:2]
-            mixing = sums.flatten(0, 1)
-            mixed = len(vergences) == 1 and len(mixing) < groups  # of layers the PSFs themselves tell what they hide
-            if mixed:  # each sum is a band of its own, of one plane and for one channel
-                of_plane, of_channel = (
-                    torch.eye(count).repeat(1, channels),
-                    torch.eye(channels).repeat_interleave(count, 1),
-                )
-                rendering |= {"spectra": of_plane.to(like), "weights": of_channel.to(like), "shares": None}
-        psfs = self._over_field(picture, vergences, scene.wavelengths, traced=traced)
-
-        def render(
-            bank: Tensor,
-            planes: Tensor,
-            shares: Tensor | None,
-            *,
-            occlusion: bool | None = None,
-            border: str = "zero",
-        ) -> Tensor:
-            own = rendering | {"picture": (planes.shape[-2], planes.shape[-1]), "border": border}
-            layers = Layers(planes, shares, occlusion=self.accuracy.occlusion if occlusion is None else occlusion)
-            layers.add(Renderer(bank, **own), first=0)
-            return layers.light
-
-        pixels, own = self.pixels(window, like), self.accuracy
-        spacing = own.spacing if own.field_variation else math.inf
-        return FieldPicture(
-            psfs,
-            pixels,
-            self._middle,
-            render,
-            self.border,
-            spacing,
-            varies=own.field_variation,
-            distorts=own.distortion,
-            darkens=own.relative_illumination,
-            whole=own.renormalise or own.psf_shape is None,
-            mixing=mixing,
-            mixed=mixed,
-            most=own.max_memory / 2,
-        )
+        psfs = self._over_field(picture, vergences, wavelengths, traced=traced)
+        renderer, mixing = self._renderer(scene, (1, 1), weights=weights, like=like), None
+        fewer = renderer.channels * renderer.planes < renderer.groups
+        if fewer and len(vergences) == 1:  # of layers the PSFs themselves tell what they hide
+            renderer, mixing = renderer.of_sums(), renderer.mixing().flatten(0, 1)
+        return FieldPicture(psfs, self.pixels(window, like), self._middle, renderer, self.accuracy, mixing)
 
     @no_more_than_free()
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:
@@ -713,9 +583,8 @@ class Imaging(Stage):
 
     @torch.no_grad()
     def _outermost(self, scene: Scene) -> tuple[Tensor, FieldPSFs]:
-        planes = self.working(scene)
-        vergences, _ = self.layers_of(scene, planes)
-        height, width = scene.shape[-2:]
+        vergences, _ = self.layers_of(scene, self.working(scene))
+        _, height, width = scene.shape
         sides = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64) * self.pixel_pitch
         places = torch.cartesian_prod(sides * width, sides * height) + torch.tensor(self._middle, dtype=torch.float64)
         return places, self._traced((height, width), vergences, scene.wavelengths)
@@ -726,23 +595,6 @@ class Imaging(Stage):
         vergences, shares = self.layers_of(scene, planes)
         return self._field_picture(scene, vergences=vergences, weights=weights, like=planes), planes, shares
 
-    def _zones(self, planes: Tensor) -> Iterator[tuple[Tensor | None, Tensor]]:
-        """Positions on the sensor (1, 2) [m] at which the optics know their PSFs, and what of the light falls there."""
-        if self._positions is None:
-            yield None, planes
-            return
-        picture = (planes.shape[-2], planes.shape[-1])
-        shares = field_shares(self._positions, pixel_positions(picture, self.pixel_pitch)).to(planes)
-        for position, share in zip(self._positions, shares.unbind(-1), strict=True):
-            if bool(share.any()):
-                yield position[None], planes * share
-
     @property
     def _positions(self) -> Tensor | None:
         return getattr(self.lens, "positions", None)
-
-    def _rendering(self, scene: Scene) -> dict[str, Any]:
-        """What a `Renderer` is told beside its tensors."""
-        own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
-        shares, cache = self.shares(scene.wavelengths, deep=is_deep(scene)), self._transfer_cache
-        return own | {"border": self.border, "picture": tuple(scene.shape[-2:]), "shares": shares, "cache": cache}

@@ -47,9 +47,9 @@ class LinearImaging(Imaging):
     def _finished(self, light: Tensor, weights: Tensor | None, afterwards: Tensor | None) -> Tensor:
         return light if afterwards is None else torch.einsum("cl,blyx->bcyx", afterwards, light)
 
-    def _grouped_bank(self, wavelengths: Tensor, **arguments: Any) -> Tensor:
+    def _grouped_bank(self, nodes: Tensor, **arguments: Any) -> Tensor:
         with _optics():
-            return super()._grouped_bank(wavelengths, **arguments)
+            return super()._grouped_bank(nodes, **arguments)
 
     def _traced(self, *arguments: Any) -> FieldPSFs:
         with _optics():

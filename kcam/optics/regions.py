@@ -5,6 +5,8 @@ Depth layers are one partition of a picture with shares that sum to 1, zones of 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import scipy
 import torch
@@ -17,6 +19,20 @@ def pixel_positions(picture: tuple[int, int], pixel_pitch: float) -> Tensor:
     """Where the light of each pixel of an upright picture falls on the sensor, (H, W, 2) of x, y [m]: turned about."""
     y, x = (-(torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * pixel_pitch for n in picture)
     return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+
+
+def zones(planes: Tensor, positions: Tensor | None, *, pixel_pitch: float) -> Iterator[tuple[Tensor | None, Tensor]]:
+    """Each of some positions (F, 2) on the sensor [m], as (1, 2), and what of the light of planes (..., H, W) falls
+    there; without positions all of it.
+    """
+    if positions is None:
+        yield None, planes
+        return
+    picture = (planes.shape[-2], planes.shape[-1])
+    shares = field_shares(positions, pixel_positions(picture, pixel_pitch)).to(planes)
+    for position, share in zip(positions, shares.unbind(-1), strict=True):
+        if bool(share.any()):
+            yield position[None], planes * share
 
 
 def field_shares(nodes: Tensor, at: Tensor) -> Tensor:

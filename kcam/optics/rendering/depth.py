@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -24,6 +26,40 @@ def few_values(values: Tensor, *, at_most: int) -> Tensor | None:
         return None
     found = flat.unique()
     return found if found.numel() <= at_most else None
+
+
+def layer_vergences(
+    vergence: Tensor,
+    layers: int | Sequence[float] | Tensor | None,
+    *,
+    known: Tensor | None,
+    steps: Callable[[float], float],
+) -> Tensor:
+    """Vergences of the layers that a scene is cut into, ascending (Z,), as `Imaging.depth_layers` tells [1/m].
+
+    Args: vergence: of pixels or samples [1/m]. layers: how many, or their distances [m]; None for the rule. known: at
+        which the optics have PSFs, if not at all. steps: that a span of vergence takes.
+    """
+    if vergence.ndim == 1 and len(vergence) > 1:
+        return vergence.unique()
+    low, high = vergence.min(), vergence.max()
+    span = float((high - low).detach())
+    if span == 0:
+        return vergence.mean()[None] if differentiated(vergence) else low[None]
+    if not isinstance(layers, int | None):
+        return 1 / torch.as_tensor(layers, dtype=torch.float64, device=vergence.device)
+    if layers is None and known is not None:  # between them PSFs are linear, as shares of layers are
+        known = known.to(vergence.device)
+        return torch.cat([low[None], known[(known > low.detach()) & (known < high.detach())], high[None]])
+    if layers is None:
+        layers = 1 + math.ceil(steps(span))
+        own = None if differentiated(vergence) else few_values(vergence, at_most=layers)
+        if own is not None:
+            return own
+    if layers == 1:
+        return (low + high)[None] / 2
+    share = torch.linspace(0, 1, layers, dtype=torch.float64, device=vergence.device)
+    return low + (high - low) * share
 
 
 def alike(scene: Scene) -> list[Tensor]:

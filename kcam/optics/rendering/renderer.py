@@ -36,6 +36,17 @@ class Renderer(Bank):
         return bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
 
     @property
+    def at_once(self) -> int:
+        """Layers whose PSFs are computed together: as many as fit into a quarter of the memory."""
+        return max(1, int(self.max_memory / 4 // (self.bands * math.prod(self.window) * self.psfs.element_size())))
+
+    def of_sums(self) -> Renderer:
+        """The same for PSFs that `mixing` has summed up: each is a band of its own, of one plane, for one channel."""
+        of_plane = torch.eye(self.planes).repeat(1, self.channels)
+        of_channel = torch.eye(self.channels).repeat_interleave(self.planes, 1)
+        return replace(self, spectra=of_plane.to(self.psfs), weights=of_channel.to(self.psfs), shares=None)
+
+    @property
     def _of_masks(self) -> Bank:
         """Where zeros lie beyond the picture it is dark there, not empty: what stands at the border goes on."""
         return replace(self, border="replicate") if self.border == "zero" else self
