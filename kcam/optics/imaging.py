@@ -562,13 +562,17 @@ class Imaging(Stage):
     @no_more_than_free()
     @torch.no_grad()
     def apart(self, scene: Scene, *, colour_filter: Absorber | None = None) -> int:
-        """How many pixels lie between the places of a picture over the field, at least; arguments as of `explain`."""
+        """How many pixels lie between the places of a picture over the field, at least; its longer side where it has
+        one on purpose. Arguments and errors as of `explain`.
+        """
+        if not self.varies:
+            raise ValueError("every pixel of this picture sees one PSF: there is one place.")
         if self.accuracy.spacing is not None:
             return self.accuracy.spacing
         found = []
         for rows in alike(scene):
             field, planes, shares = self._asked(scene.samples(rows), colour_filter)
-            found.append(int(field.how(*field.moved(planes, shares)).apart))
+            found.append(int(min(field.how(*field.moved(planes, shares)).apart, max(scene.shape[1:]))))
         return min(found)
 
     def distorted(self, scene: Scene) -> float:

@@ -7,6 +7,7 @@ import functools
 import pytest
 import torch
 from draws import Draw
+from draws import Draw
 from torch import Tensor
 
 from kcam import Camera, Scene, optics
@@ -99,6 +100,21 @@ def test_cameras_with_one_psf_have_no_such_rows() -> None:
     shot = camera(field=False)
     found = rows(plan_of(shot, stars(), 0.01))
     assert not set(ROWS) & set(found)
+
+
+SWITCHES = ("distortion", "field_variation", "lateral_colour", "relative_illumination", "blur", "occlusion")
+SETTINGS = {"spacing": 20, "bands": 2, "interpolate_bands": True, "psf_shape": (9, 9), "layers": 2, "kappa": None}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_plans_for_cameras_with_shortcuts_of_their_own(seed: int) -> None:
+    """Whatever a camera leaves out by itself, a plan is made beside it, and holds."""
+    draw = Draw(seed)
+    own: dict = {name: False for name in SWITCHES if draw.number(0, 1) < 0.4}
+    own |= {name: value for name, value in SETTINGS.items() if draw.number(0, 1) < 0.3}
+    shot, light = camera(**own), stars(seed=seed)
+    plan = plan_of(shot, light, 0.02)
+    assert plan.measure(shot, light) <= 0.02, own
 
 
 def test_shortcuts_and_plans_are_saved(tmp_path) -> None:
