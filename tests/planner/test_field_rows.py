@@ -7,7 +7,6 @@ import functools
 import pytest
 import torch
 from draws import Draw
-from draws import Draw
 from torch import Tensor
 
 from kcam import Camera, Scene, optics
