@@ -518,7 +518,7 @@ def augmentations() -> list[type]:
         for value in vars(KC).values()
         if isinstance(value, type) and value.__name__.startswith("Random") and value.__module__.startswith("kcam.")
     ]
-    return sorted(found, key=lambda cls: order.index(cls.__module__.rsplit(".", 1)[1]))
+    return sorted(found, key=lambda cls: order.index(cls.__module__.split(".")[2]))
 
 
 def augmentations_table() -> str:
