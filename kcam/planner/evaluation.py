@@ -47,6 +47,7 @@ LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of 
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
 WITNESSED = 2**20  # pixels of the last trial
 NOTHING: Shortcuts = {}
+CUT = 1.01  # RMS of light over that of what the full well leaves of it, from which on that matters
 HARDLY = 3e-3  # RMS of light that may be hidden, of what is recorded, that is taken for what it changes at most
 
 
@@ -145,8 +146,8 @@ class Evaluator:
             return
         energies = torch.stack([given[behind][0].double().square().sum().cpu() for given in self.signals])
         rows = energies.split([len(sample.owners) for sample in self.samples])
-        for spectra, own in zip(self.spectra or (), rows, strict=True):
-            spectra.compare(settings, own)
+        for sample, spectra, own in zip(self.samples, self.spectra or (), rows, strict=True):
+            spectra.compare(settings, own, cut=torch.tensor([self.lost[owner] > CUT for owner in sample.owners]))
 
     def _hideable(self, sample: Sample) -> Tensor:
         """See `Spectra`."""

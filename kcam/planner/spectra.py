@@ -113,12 +113,16 @@ class Spectra:
         recorded, wavelengths = _recorded(camera, scene), scene.wavelengths
         return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths, hidden=hidden)
 
-    def compare(self, settings: Mapping[str, Any], recorded: Tensor) -> None:
+    def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> None:
         """Take what pixels truly record with some settings, the energy of each row (B,), for what errors are relative
         to, where that is less than what spectra say: of a light that falls on pixels which see little of its colour,
-        or of light beyond borders that are not mirrors.
+        or of light beyond borders that are not mirrors. cut: rows of which the full well cuts light off, so that what
+        is left of it is known with these settings alone.
         """
         said = self._linear(settings, settings, exactly=True)[1]
+        if bool(cut.any()):
+            every = {**settings, "bands": None}
+            said = torch.where(cut, self._linear(every, every)[1], said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
 
     @functools.cached_property

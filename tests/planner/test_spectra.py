@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -80,6 +81,22 @@ def test_transfer_functions_are_those_of_the_psf(seed: int) -> None:
     assert found.shape == (2, 4, 2, 60)
     assert torch.equal(found[:, :, 0], found[:, :, 1])
     torch.testing.assert_close(found[:, :, 0], expected, rtol=0, atol=3e-3)
+
+
+@pytest.mark.parametrize("shape", [(33, 33), (257, 257), (49, 401), (33, 129)])
+@pytest.mark.parametrize("seed", range(4))
+def test_windows_hold_the_light_that_transfer_functions_begin_with(seed: int, shape: tuple[int, int]) -> None:
+    """At all wavelengths, and where a window is longer than what is known of the light, or than it is high."""
+    draw = Draw(seed)
+    focus = 1 / draw.number(0.1, 2)
+    aperture, glass = optics.CircularAperture(draw.number(2, 6) * mm), optics.ThinLens(50 * mm)
+    lens = optics.Lens(aperture, glass, focus_distance=focus)
+    vergences = torch.tensor([1 / focus, 1 / focus + draw.number(-0.05, 0.05)], dtype=torch.float64)
+    pixels = PixelGrid(draw.number(2, 6) * um, shape, 1.0, True, torch.float64)
+    query = lens.question(Points(vergences), wavelength_grid(count=4), pixels)
+    largest = dataclasses.replace(query, grid=dataclasses.replace(pixels, shape=(401, 401)))
+    found = RADIAL.transfer(largest)(torch.zeros(1, dtype=torch.float64), shape, range(4))[..., 0, 0]
+    torch.testing.assert_close(found, RADIAL(query).sum((-2, -1)), rtol=0, atol=2e-4)
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])

@@ -105,7 +105,7 @@ class RadialTransfer:
     Args:      light: |U|^2 t dt / (4 pi^2 E) at even t, (L, Z, T), with Euler and Maclaurin's corrections near 0.
                kernel: 2 pi J0(kappa t) at even kappa up to 2, (T, K).
                step: of t [pixels], (L,). kappa: entries of the kernel for each cycle per pixel, (L,).
-               rim: T [pixels], (L,). reach: where the table ends [pixels].
+               rim: T [pixels], (L,).
                active: width of the light-sensitive part of a pixel; None where no pixel is integrated over.
     """
 
@@ -114,7 +114,6 @@ class RadialTransfer:
     step: Tensor
     kappa: Tensor
     rim: Tensor
-    reach: float
     active: float | None
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
@@ -132,12 +131,20 @@ class RadialTransfer:
         if self.active is not None:
             value = value * torch.sinc(along * self.active) * torch.sinc(across * self.active)
         found = value.sum((-2, -1))
-        if (edge := math.sqrt(math.prod(shape) / math.pi)) > self.reach:  # INT J0(2 pi f r) dr / r^2
-            share = (torch.arange(_TAIL, dtype=torch.float64, device=step.device) + 0.5) / _TAIL
-            nodes = 1 / self.reach + (1 / edge - 1 / self.reach) * share
-            tail = BesselJ0.apply(2 * math.pi * frequencies / nodes[:, None]).mean(0)
-            found = found + (self.rim[chosen] * (1 / self.reach - 1 / edge))[:, None, None] * tail
+        found = found + self._beyond(frequencies, shape, chosen)[:, None]
         return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
+
+    def _beyond(self, frequencies: Tensor, shape: tuple[int, int], chosen: Tensor) -> Tensor:
+        """Of the light in a window beyond the table, INT share(r) J0(2 pi f r) T dr / r^2, (L, F)."""
+        reach = (self.light.shape[-1] - 0.5) * self.step[chosen, None]  # the last step goes half as far again
+        corner = torch.clamp(reach, min=math.hypot(*shape) / 2)
+        if not bool((corner > reach).any()):
+            return torch.zeros((), dtype=torch.float64, device=reach.device)[None]
+        share = (torch.arange(_TAIL, dtype=torch.float64, device=reach.device) + 0.5) / _TAIL
+        radius = 1 / (1 / reach + (1 / corner - 1 / reach) * share)  # (L, R)
+        rings = BesselJ0.apply(2 * math.pi * frequencies * radius[..., None])
+        tail = (_share_inside(shape, radius)[..., None] * rings).mean(1)
+        return tail * self.rim[chosen, None] * (1 / reach - 1 / corner)
 
 
 def radial_transfer(query: Query) -> RadialTransfer:
@@ -161,7 +168,6 @@ def radial_transfer(query: Query) -> RadialTransfer:
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
         rim=rim / pitch,
-        reach=reach / pitch,
         active=query.grid.active if query.grid.integrate else None,
     )
 
