@@ -55,6 +55,9 @@ EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
 CANCELLED = {torch.float32: 2e-5, torch.float64: 1e-13}
 """What is left of a picture's precision where planes of either sign add up to it."""
 
+ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
+"""By which two ways to the same picture differ."""
+
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
@@ -122,7 +125,7 @@ class Ladder:
         key = self._key(self.position)
         if self.at_top:
             return 0.0
-        return self.errors[key] if key in self.errors else self.off_by * self.roughly[key]
+        return max(self.errors[key], self.least) if key in self.errors else self.off_by * self.roughly[key]
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -251,7 +254,10 @@ def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[La
         return []
     view = _View(evaluator, imaging, scene, one=one)
     evaluator.look(view.beside | view.coarse)
-    return [ladder for make in LADDERS for ladder in make(view)]
+    found = [ladder for make in LADDERS for ladder in make(view)]
+    for ladder in found:
+        ladder.least = max(ladder.least, ROUNDED[imaging.working(scene).dtype])
+    return found
 
 
 class _View:

@@ -151,7 +151,8 @@ class Range:
         What differs between wavelengths and distances is foretold to the power of 2: in one scene errors cancel, or lie
         in the dark, that add up in another.
         """
-        depth, relative = bool({"layers", "occlusion"} & set(changes)), found.relative().tolist()
+        depth = bool({"layers", "occlusion", "psf_shape"} & set(changes))  # a window holds what is not far out of focus
+        relative = found.relative().tolist()
         hidden = max(1.0, math.sqrt((1 + self.saturated) / (1 + relative[-1]))) if hides else 1.0
         for kind, ours, planned in zip(KINDS, relative, self.potential, strict=True):
             if depth or kind not in OF_DEPTH:
