@@ -24,7 +24,7 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.random_stage import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH = 0.5
+WORTH = 0.4
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves: measured."""
 
 SENSOR = "sensor"
