@@ -11,6 +11,7 @@ layers hide of each other is off by as much as their masks are in even light, ti
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Iterator, Mapping
@@ -55,7 +56,7 @@ _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is 
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
-_WHOLE = 3e-3  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 % at most
+_WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
 
 
 @dataclass(frozen=True)
@@ -415,10 +416,12 @@ def _compressed(scene: Scene) -> Scene:
     spectra = spectra.to(planes)
     energies, directions = torch.linalg.eigh((spectra.T @ (flat @ flat.T) @ spectra).double())
     left_out = energies.clamp(min=0).cumsum(0)
-    least = int((left_out[:-1] <= _WHOLE**2 * left_out[-1]).sum())
-    if (few := directions[:, least:].to(planes)).shape[1] >= len(flat):
-        return scene
-    return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, spectra @ few), spectra=few.T)
+    for share in _WHOLE:
+        few = directions[:, int((left_out[:-1] <= share**2 * left_out[-1]).sum()) :].to(planes)
+        if few.shape[1] < len(flat):
+            with contextlib.suppress(ValueError):  # light would be negative somewhere, by more than a scene lets pass
+                return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, spectra @ few), spectra=few.T)
+    return scene
 
 
 def _inside(query: Query) -> bool:

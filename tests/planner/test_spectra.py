@@ -17,8 +17,8 @@ from kcam.optics.source import PixelGrid, Points
 from kcam.planner.band_counts import even_counts, node_counts
 from kcam.planner.evaluation import Evaluator, _error
 from kcam.planner.ladders import LITTLE, Ladder, Level
-from kcam.planner.spectra import Spectra
-from kcam.units import mm, um, wavelength_grid
+from kcam.planner.spectra import Spectra, _compressed
+from kcam.units import mm, nm, um, wavelength_grid
 
 CHANGES = [
     ({"bands": 3, "blur": False}, {"bands": 3}),
@@ -195,6 +195,29 @@ def test_windows_are_priced_in_grey_and_coloured_by_line_spreads(grey: float, fa
     ladder = Ladder("PSF support", [*levels, Level("all", {})], {"bands": 2}, off_by=5.0, from_top=True)
     ladder.price(evaluator, 0.2)
     assert ladder.error == pytest.approx(0.1 * factor)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_fewer_planes_hold_the_light(seed: int) -> None:
+    """Of cubes and of factored scenes, with dark pixels, a hot one and dim items: to the share that may be left out."""
+    draw, generator = Draw(seed), torch.Generator().manual_seed(seed)
+    grid, batch, count = wavelength_grid(), draw.one_of(1, 3), draw.one_of(3, 12)
+    centres = torch.rand(count, 1, generator=generator) * 300 + 420
+    spectra = torch.exp(-0.5 * ((grid.float() / nm - centres) / draw.number(10, 80)) ** 2)
+    planes = torch.rand(batch, count, 20, 24, generator=generator) ** draw.one_of(1, 8)
+    planes[:, :, 5, 6] *= draw.one_of(1.0, 1e4)
+    planes[0] *= draw.one_of(1.0, 1e-3)
+    planes[:, draw.one_of(0, 1, 2)] *= torch.rand(batch, 20, 24, generator=generator) < 0.05
+    light = Scene(planes, spectra, grid, 2.0)
+    if draw.one_of(True, False):
+        light = Scene.from_bands(light.bands(), wavelengths=grid, depth=2.0)
+    found = _compressed(light)
+    assert found.coefficients.shape[1] <= light.coefficients.shape[1]
+    brightness = light.bands().norm(dim=1, keepdim=True).sqrt()
+    off, whole = (
+        (bands / brightness).flatten(1).norm(dim=1) for bands in (found.bands() - light.bands(), light.bands())
+    )
+    assert bool((off <= 3.1e-3 * batch**0.5 * whole).all())
 
 
 @pytest.mark.parametrize("own", [None, 5])
