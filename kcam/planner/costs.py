@@ -175,4 +175,4 @@ def _pictures() -> Iterator[tuple[str, optics.Imaging, Scene, ColourFilter | Non
 
 
 def _imaging(lens: optics.source.PSFSource, **arguments: Any) -> optics.Imaging:
-    return optics.Imaging(lens, pixel_pitch=4 * um, **arguments)
+    return optics.Imaging(lens, pixel_pitch=4 * um).changed(**arguments)  # which does not warn of few layers
