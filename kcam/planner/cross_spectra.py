@@ -26,6 +26,7 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
     height, width = planes.shape[-2:]
     if dark:
         found = scipy.fft.rfftn(planes.cpu().numpy(), s=(2 * height, 2 * width), axes=(-2, -1), norm="ortho")
+        found[..., 1:width] *= math.sqrt(2)  # each stands for one to the left of the middle, too
         spectrum = torch.view_as_real(torch.as_tensor(found))
     else:
         spectrum = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]

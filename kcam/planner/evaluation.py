@@ -136,18 +136,24 @@ class Evaluator:
                 )
                 for sample in self.samples
             ]
-            self._compare({name: value for name, value in few.items() if name != "occlusion"})
+            if not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
+                self.spectra = None
 
-    def _compare(self, settings: Mapping[str, Any]) -> None:
-        """What spectra say of the light with what was seen of it, where nothing but colours lies between."""
-        between = (Imaging, Transmission, ColourFilter, Mosaic)
+    def _compare(self, settings: Mapping[str, Any]) -> bool:
+        """What spectra say of the light with what was seen of it, where nothing but colours lies between; whether they
+        tell of it at all.
+        """
+        between: tuple[type, ...] = (Imaging, ColourFilter, Mosaic)
+        if any(isinstance(stage, ColourFilter) for stage in self.raw_camera):  # which is seen behind the glass
+            between += (Transmission,)
         behind = 1 + max(index for index, stage in enumerate(self.raw_camera) if isinstance(stage, between))
         if not all(isinstance(stage, between) for stage in list(self.raw_camera)[:behind]):
-            return
+            return True
         energies = torch.stack([given[behind][0].double().square().sum().cpu() for given in self.signals])
         rows = energies.split([len(sample.owners) for sample in self.samples])
-        for sample, spectra, own in zip(self.samples, self.spectra or (), rows, strict=True):
-            spectra.compare(settings, own, cut=torch.tensor([self.lost[owner] > CUT for owner in sample.owners]))
+        cut = ([self.lost[owner] > CUT for owner in sample.owners] for sample in self.samples)
+        parts = zip(self.spectra or (), rows, cut, strict=True)
+        return all(spectra.compare(settings, own, cut=torch.tensor(lost)) for spectra, own, lost in parts)
 
     def _hideable(self, sample: Sample) -> Tensor:
         """See `Spectra`."""

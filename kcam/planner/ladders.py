@@ -34,7 +34,7 @@ FASTEST = 2.0
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
 
-BY_LINES, BY_ONE = 5.0, 3.0
+BY_LINES, BY_ONE = 5.0, 4.0
 """How many times too large or too small rough errors may be: of the PSF's window by line spreads instead of PSFs, which
 only refuse, and of pupil samples at one wavelength instead of a few. Of 300 random pairs they were 0.18 to 5.5 times
 the others, and of 150, where they were above `COARSE`, 0.37 to 3.7 times.
@@ -188,10 +188,8 @@ class Ladder:
         return self.roughly[key]
 
     def _settled(self, roughly: float, most: float) -> bool:
-        """Whether a rough estimate says enough: that this may do in any case, or in none. Nothing at all is no
-        estimate: one wavelength may have the same grid either way.
-        """
-        return 0 < self.off_by * roughly <= LITTLE * most or roughly > self.off_by * most
+        """Whether a rough estimate says enough: that this may do in any case, or in none."""
+        return self.off_by * roughly <= LITTLE * most or roughly > self.off_by * most
 
     def _beyond(self, evaluator: Evaluator) -> float:
         """What is left from here to where rungs converge, by the steps up to here: that of the foot by the next one.

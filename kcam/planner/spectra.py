@@ -53,6 +53,7 @@ WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
 _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
+_GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
@@ -114,17 +115,23 @@ class Spectra:
         recorded, wavelengths = _recorded(camera, scene), scene.wavelengths
         return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths, hidden=hidden)
 
-    def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> None:
+    def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> bool:
         """Take what pixels truly record with some settings, the energy of each row (B,), for what errors are relative
         to, where that is less than what spectra say: of a light that falls on pixels which see little of its colour,
         or of light beyond borders that are not mirrors. cut: rows of which the full well cuts light off, so that what
         is left of it is known with these settings alone.
+
+        Returns: whether spectra tell of this scene: not where much more is recorded, of light that goes on beyond a
+        replicated border.
         """
         said = self._linear(settings, settings, exactly=True)[1]
+        if self.imaging.border == "replicate" and bool((recorded > _GOES_ON * said).any()):
+            return False
         if bool(cut.any()):
             every = {**settings, "bands": None}
             said = torch.where(cut, self._linear(every, every)[1], said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
+        return True
 
     @functools.cached_property
     def grey(self) -> Spectra:
@@ -410,10 +417,11 @@ def _compressed(scene: Scene) -> Scene:
     that the rest counts beside a few bright lights, and dim items beside bright ones.
     """
     planes = scene.coefficients.detach()
-    light = planes.norm(dim=1, keepdim=True).clamp(min=torch.finfo(planes.dtype).tiny)
-    flat = (planes / (light * light.sum((-2, -1), keepdim=True)).sqrt()).transpose(0, 1).flatten(1)
-    spectra = torch.eye(len(flat)) if scene.spectra is None else scene.spectra
-    spectra = spectra.to(planes)
+    spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).to(planes)
+    onto_light = torch.linalg.qr(spectra.T).R  # as long as the radiance
+    light = torch.einsum("lk,bkhw->blhw", onto_light, planes).norm(dim=1, keepdim=True)
+    light = light.clamp(min=torch.finfo(planes.dtype).tiny)
+    flat = (planes / light.sqrt() / light.sum((-2, -1), keepdim=True).sqrt()).transpose(0, 1).flatten(1)
     energies, directions = torch.linalg.eigh((spectra.T @ (flat @ flat.T) @ spectra).double())
     left_out = energies.clamp(min=0).cumsum(0)
     for share in _WHOLE:

@@ -135,9 +135,9 @@ def test_wavelengths_between_which_others_lie(total: int, expected: list[int]) -
 @pytest.mark.parametrize("off", [0.0, 1 / 8, 1.0, 8.0])
 def test_a_rough_estimate_settles_only_what_it_may(truth: float, off: float) -> None:
     """However far it is off within what it says of itself: no rung is taken that may not do, nor one refused that does,
-    and what is stated is at least the truth.
+    and what is stated is at least the truth. Nothing at all is taken for the least that there may be.
     """
-    most, asked = 0.01, []
+    most, asked, least = 0.01, [], 0.0 if off else truth / 8
 
     def error(ours: dict, theirs: dict, *, roughly: bool) -> float:
         asked.append(roughly)
@@ -145,12 +145,13 @@ def test_a_rough_estimate_settles_only_what_it_may(truth: float, off: float) -> 
 
     evaluator = SimpleNamespace(error=error)
     levels = [Level("coarse", {"kappa": 1.3}), Level("fine", {})]
-    ladder = Ladder("pupil samples", levels, {}, off_by=8.0)
+    ladder = Ladder("pupil samples", levels, {}, off_by=8.0, least=least)
     ladder.price(evaluator, most)
     assert (ladder.error <= most) == (truth <= most)
     assert ladder.error >= truth
     assert asked[0]
-    assert len(asked) == (1 if 0 < 8 * truth * off <= LITTLE * most or truth * off > 8 * most else 2)
+    rough = max(truth * off, least)
+    assert len(asked) == (1 if 8 * rough <= LITTLE * most or rough > 8 * most else 2)
     before = len(asked)
     ladder.price(evaluator, truth)  # for a tolerance at which it is asked more of
     assert ladder.error <= truth or len(asked) == before
@@ -208,12 +209,16 @@ def test_fewer_planes_hold_the_light(seed: int) -> None:
     planes[:, :, 5, 6] *= draw.one_of(1.0, 1e4)
     planes[0] *= draw.one_of(1.0, 1e-3)
     planes[:, draw.one_of(0, 1, 2)] *= torch.rand(batch, 20, 24, generator=generator) < 0.05
+    planes[-1, :, draw.one_of(0, 3) :] *= draw.one_of(0.0, 1.0)
+    scale = draw.one_of(1.0, 1e6)  # of one spectrum, whose plane is so much less
+    planes[:, 1] *= scale
+    spectra[1] /= scale
     light = Scene(planes, spectra, grid, 2.0)
     if draw.one_of(True, False):
         light = Scene.from_bands(light.bands(), wavelengths=grid, depth=2.0)
     found = _compressed(light)
     assert found.coefficients.shape[1] <= light.coefficients.shape[1]
-    brightness = light.bands().norm(dim=1, keepdim=True).sqrt()
+    brightness = light.bands().norm(dim=1, keepdim=True).clamp(min=1e-30).sqrt()
     off, whole = (
         (bands / brightness).flatten(1).norm(dim=1) for bands in (found.bands() - light.bands(), light.bands())
     )
@@ -252,6 +257,35 @@ def test_one_light_falls_on_pixels_of_one_colour(place: tuple[int, int], colour:
         for ours in ({"psf_shape": (17, 17)}, {"psf_shape": (33, 33)}):
             trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers({}))
             assert 0.75 < evaluator.error(ours, {}) / trial < 3
+
+
+@pytest.mark.parametrize("border", ["reflect", "replicate", "zero"])
+@pytest.mark.parametrize("place", [(0, 0), (0, 21), (13, 20)])
+@pytest.mark.parametrize("colour", [(1.0, 0.1, 0.1), (1.0, 1.0, 1.0)])
+def test_plans_hold_for_one_light_at_a_border(border: str, place: tuple[int, int], colour: tuple[float, ...]) -> None:
+    lens = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(50 * mm), focus_distance=1.0)
+    imaging = optics.Imaging(lens, pixel_pitch=6 * um, border=border)
+    camera = Camera(imaging, sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB"))
+    picture = torch.full((3, 48, 48), 1e-4)
+    picture[:, place[0], place[1]] = torch.tensor(colour)
+    light = Scene.from_rgb(picture, depth=0.8)
+    for tolerance in (0.1, 0.02):
+        plan = camera.plan(light, tolerance=tolerance)
+        assert plan.measure(camera, light) <= tolerance
+        assert plan.measure(camera, light) <= plan.bound / 0.75 + 1e-6
+
+
+@pytest.mark.parametrize("transmission", [0.1, 1.0])
+def test_glass_without_a_filter_dims_picture_and_error_alike(transmission: float) -> None:
+    glass = sensor.Transmission(torch.tensor([400.0, 740.0]) * nm, torch.full((2,), transmission))
+    lens = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(50 * mm), focus_distance=1.0)
+    camera = Camera(optics.Imaging(lens, pixel_pitch=6 * um), glass)
+    light = Scene.from_rgb(torch.rand(3, 40, 48, generator=torch.Generator().manual_seed(0)), depth=0.9)
+    with torch.no_grad():
+        evaluator = Evaluator(camera, [light])
+        evaluator.look({"bands": 2})
+        trial = _error(evaluator.samples, evaluator.answers({"bands": 1}), evaluator.answers({"bands": 4}))
+        assert evaluator.error({"bands": 1}, {"bands": 4}) == pytest.approx(trial, rel=0.3)
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
