@@ -417,6 +417,7 @@ def _compressed(scene: Scene) -> Scene:
     that the rest counts beside a few bright lights, and dim items beside bright ones.
     """
     planes = scene.coefficients.detach()
+    planes = planes.to(torch.promote_types(planes.dtype, torch.float32))
     spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).to(planes)
     onto_light = torch.linalg.qr(spectra.T).R  # as long as the radiance
     light = torch.einsum("lk,bkhw->blhw", onto_light, planes).norm(dim=1, keepdim=True)
