@@ -39,10 +39,10 @@ OF_DEPTH = [
     "seed", [n if n in (0, 2, 3, 6) else pytest.param(n, marks=pytest.mark.slow) for n in range(40)]
 )
 def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
-    """Cameras and scenes of benchmarks/planner.py: at one distance to two fifths; not much too small, and at most 2.5 times
-    as large where few points are all the light (they show corners and colours of pixels), three times where a window as
-    large as the picture is smaller than the blur; with depth, where things hide others, or beyond the full well, not
-    much too small.
+    """Cameras and scenes of benchmarks/planner.py: at one distance to two fifths; not much too small, and at most 2.5
+    times as large where few points are all the light (they show corners and colours of pixels), three times where a
+    window as large as the picture is smaller than the blur; with depth, where things hide others, or beyond the full
+    well, not much too small.
     """
     camera, scene, text, _ = random_pair(seed, longest=1.0)
     with torch.no_grad():
