@@ -381,12 +381,13 @@ class Imaging(Stage):
             return planes.double()
         return planes.float()
 
-    def vergences(self, scene: Scene, depth: Tensor) -> Tensor:
+    def vergences(self, scene: Scene, depth: Tensor, *, wavelengths: Tensor | None = None) -> Tensor:
         """Of the layers that a scene is cut into, (Z,) [1/m]: half as far apart where a few lights stand out, whose own
-        blur is seen, not its mean.
+        blur is seen, not its mean. wavelengths: (L,) [m] that ask for them; None for the scene's.
         """
         fine = depth.numel() > 1 and wide_range(scene)
-        return self.depth_layers(depth, scene.wavelengths, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
+        light = scene.wavelengths if wavelengths is None else wavelengths
+        return self.depth_layers(depth, light, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
 
     def layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vergences of the layers in which there is anything, (Z,) [1/m], and the share of each pixel in them,

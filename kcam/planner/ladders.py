@@ -19,7 +19,6 @@ from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GREY, GRIDS, ROUND, even_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
-from kcam.planner.spectra import WINDOWS
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -58,6 +57,7 @@ CANCELLED = {torch.float32: 2e-5, torch.float64: 1e-13}
 ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 """By which two ways to the same picture differ."""
 
+WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)

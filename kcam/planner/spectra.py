@@ -47,9 +47,6 @@ WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 WINDOW = {"psf_shape", "renormalise"}
 """Of those, those that line spreads tell roughly."""
 
-WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)
-"""Sides of the windows of PSFs that may stand for the whole [pixels]."""
-
 _HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
@@ -124,14 +121,22 @@ class Spectra:
         Returns: whether spectra tell of this scene: not where much more is recorded, of light that goes on beyond a
         replicated border.
         """
-        said = self._linear(settings, settings, exactly=True)[1]
+        said = self._whole(settings, exactly=True)
         if self.imaging.border == "replicate" and bool((recorded > _GOES_ON * said).any()):
             return False
         if bool(cut.any()):
             every = {**settings, "bands": None}
-            said = torch.where(cut, self._linear(every, every)[1], said)
+            said = torch.where(cut, self._whole(every, exactly=False), said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
         return True
+
+    def _whole(self, settings: Mapping[str, Any], *, exactly: bool) -> Tensor:
+        """The energy of each row with some settings, (B,)."""
+        found = torch.zeros(len(self.scene.coefficients), dtype=torch.float64)
+        for index, (rows, _) in enumerate(self.groups):
+            layered = self._of(index, settings.get("layers"))
+            found[rows] = self._energy(self._once(index, layered, settings, settings, exactly=exactly), layered)
+        return found
 
     @functools.cached_property
     def grey(self) -> Spectra:
@@ -217,10 +222,10 @@ class Spectra:
         return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
 
     def _linear(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, exactly: bool = False
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        exactly = exactly or _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
+        exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
         factor = (1.0 if self.fits else _CUT) * (_BETWEEN if _differ(changes, against, {"interpolate_bands"}) else 1.0)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
@@ -261,13 +266,11 @@ class Spectra:
 
     def _cutting(self, scene: Scene, layers: Any) -> Imaging:
         """The stage with so many layers, or as many as light of all wavelengths asks for: a few ask for fewer."""
-        imaging, count = self.imaging, len(self.wavelengths)
-        if layers is not None:
-            imaging = imaging.changed(layers=layers)
-        if imaging.accuracy.layers is not None or not is_deep(scene) or len(scene.wavelengths) == count:
+        imaging = self.imaging if layers is None else self.imaging.changed(layers=layers)
+        if imaging.accuracy.layers is not None or not is_deep(scene) or len(scene.wavelengths) == len(self.wavelengths):
             return imaging
-        whole = replace(scene, spectra=torch.ones(1, count), wavelengths=self.wavelengths, illuminant=torch.ones(count))
-        vergences = imaging.vergences(whole, torch.as_tensor(scene.depth, dtype=torch.float64))
+        depth = torch.as_tensor(scene.depth, dtype=torch.float64)
+        vergences = imaging.vergences(scene, depth, wavelengths=self.wavelengths)
         return imaging.changed(layers=tuple((1 / vergences).tolist()))
 
     def _once(

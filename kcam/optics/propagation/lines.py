@@ -263,8 +263,7 @@ class _OntoRows:
         weights *= density * self.widths
         phase = 2 * math.pi / wavelength * (self.coefficients[index] @ self.maps)
         re, im = (
-            (weights * part[:, None].to(weights)).unflatten(-1, (self.parts, -1)).sum(-2)
-            for part in (phase.cos(), phase.sin())
+            (weights * part[:, None].to(weights)).unflatten(-1, (self.parts, -1)).sum(-2) for part in sines(phase)
         )
         return re, im
 
