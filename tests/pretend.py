@@ -84,7 +84,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         here["device"] = torch.device("cpu")
     result = _AT_ONCE.get(func, func)(*tree_map(_here, args), **here)
     written = [a for a, s in zip(args, func._schema.arguments, strict=False) if s.alias_info and s.alias_info.is_write]
-    if torch.Tag.inplace_view in func.tags:  # `squeeze_`: the wrapper's shape changes too
+    if torch.Tag.inplace_view in func.tags and isinstance(args[0], Away):  # `squeeze_`: the wrapper's shape changes too
         with no_dispatch():
             func(*args, **kwargs)
     if written and isinstance(result, Tensor):

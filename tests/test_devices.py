@@ -129,6 +129,12 @@ def test_what_cuda_takes_is_taken(mix: str, device: torch.device) -> None:
     assert TAKEN[mix](here, here.to(device), device).device == device
 
 
+def test_vectors_keep_their_shape_on_either_device(device: torch.device) -> None:
+    here = torch.eye(3)
+    for one in (here, here.to(device)):
+        assert (one[0] @ one[:, :1]).shape == (1,)  # torch squeezes the row away in place
+
+
 def picture(*shape: int) -> Tensor:
     coarse = torch.rand(*shape[:-2], 9, 9, generator=torch.Generator().manual_seed(0))
     return nn.functional.interpolate(coarse, shape[-2:], mode="bicubic").clamp(0, 1)
