@@ -6,7 +6,7 @@ import json
 import math
 import textwrap
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -31,8 +31,13 @@ from kcam.sensor import ADC
 ENDS = (ADC, *DEVELOPING)
 """What stands before the first of these is the raw signal, before rounding."""
 
+ALIKE = 1.5
+"""The power in which errors of choices add up: 1 where all are alike, 2 where none is like another. Of 115 plans the
+whole was 0.86 to 1.36 times the root of the sum of squares, 1.14 times at most in 95 %.
+"""
+
 SAFETY = 1.25
-"""The sum of a plan's errors stays below the tolerance by this factor: what pricing each choice by itself misses."""
+"""A plan's errors together stay below the tolerance by this factor: what pricing each choice by itself misses."""
 UNTRIED = 1.5
 """The same, of plans that no last trial has seen."""
 
@@ -192,7 +197,7 @@ class Plan:
     """What to simulate of a camera for a scene, as a value: print it, change it, save it, apply it.
 
     tolerance: as asked for; allowed: the number that it stands for.
-    bound: sum of the counted errors, or what the last trial found if that is more; at most allowed / `SAFETY`, and
+    bound: the counted errors together, or what the last trial found if that is more; at most allowed / `SAFETY`, and
     allowed / `UNTRIED` where there was none.
     expected: root of the sum of their squares. checked: what the last trial found; None if there was none.
     changes: arguments of the camera's Imaging. skipped: indices of the stages that are left out. replaced: by index,
@@ -498,6 +503,18 @@ def shortened(camera: Camera, changes: Mapping[str, Any], shortcuts: Shortcuts) 
         if kept is not None:
             stages.append(kept)
     return Camera(*stages, context=camera.resolve())
+
+
+def together(errors: Iterable[float]) -> float:
+    """What choices with such errors cost all at once.
+
+    Example:
+    >>> from kcam.planner.plan import together
+    >>> together([0.01]), round(together([0.01, 0.01]), 4)
+    (0.01, 0.0159)
+    """
+    found = [error for error in errors if error]
+    return sum(error**ALIKE for error in found) ** (1 / ALIKE) if len(found) > 1 else sum(found)
 
 
 def shares(values: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from kcam.optics import Imaging
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw, shortened
+from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw, shortened, together
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.random_stage import RandomStage
@@ -49,7 +49,7 @@ def make_plan(
     """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
 
     A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
-    until the sum of all errors is below the tolerance / `UNTRIED`. Where the raw is linear in the light but for the
+    until all errors together are below the tolerance / `UNTRIED`. Where the raw is linear in the light but for the
     full well, those follow from spectra. Else (PSFs that vary over the picture, gradients) they are tried out, and the
     way goes on until a last trial is below the tolerance / `SAFETY`: the whole plan against the reference, each item of
     each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them.
@@ -163,7 +163,7 @@ class Planner:
         return Plan(
             tolerance=tolerance,
             allowed=allowed,
-            bound=max(sum(errors), checked or 0.0),
+            bound=max(together(errors), checked or 0.0),
             expected=math.sqrt(sum(error**2 for error in errors)),
             checked=checked,
             decisions=tuple(rows.decisions),
@@ -313,7 +313,7 @@ def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator
             own = [ladder for ladder in relevant if follows or not (isinstance(ladder, Ladder) and ladder.follows)]
             for ladder in own:
                 ladder.price(evaluator, most)
-            if sum(ladder.error for ladder in own) > most:
+            if together(ladder.error for ladder in own) > most:
                 max(own, key=_urgency).climb(evaluator, most)
                 break
         else:

@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from kcam.camera import Camera
 from kcam.isp import Clip
@@ -47,10 +48,13 @@ WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 WINDOW = {"psf_shape", "renormalise"}
 """Of those, those that line spreads tell roughly."""
 
-_HIDDEN = 1.5  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
+_HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
+_HIDDEN_LIGHTS = 1.5  # the same of few lights, and of PSFs that are cut off
+_SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture: the little seen of it is much
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
+_PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
@@ -232,7 +236,8 @@ class Spectra:
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, against, exactly=exactly) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
-            found[0, rows] *= (_HIDDEN if len(layered.vergences) > 1 and self._hides else 1.0) ** 2
+            if len(layered.vergences) > 1 and self._hides:
+                found[0, rows] *= self._replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]
 
     @functools.cached_property
@@ -240,9 +245,17 @@ class Spectra:
         """What the energy of a difference may be, of that in the mean over directions, (B,): more by 1 over the number
         of lights, if few have most of the energy. Their spectrum is even: it shows the corners of a window.
         """
-        light = self._light.double().flatten(1).cpu().square()
-        lights = light.sum(1).square() / light.square().sum(1).clamp(min=1e-300)
-        return 1 + 1 / lights.clamp(min=1)
+        return 1 + 1 / _lights(self._light)
+
+    @functools.cached_property
+    def _replaced(self) -> Tensor:
+        """Times the error without occlusion that there is with it, (B,)."""
+        light, defocus = self._light, self.imaging.defocus(self.wavelengths)
+        patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
+        few = torch.minimum(_lights(light), _lights(patches)) < _FEW
+        found = torch.where(few | (not self.fits), _HIDDEN_LIGHTS, _HIDDEN).double()
+        wide = defocus.radius(self._ends) - defocus.floor > min(self.picture) / 2
+        return found.fill_(_SEEN_THROUGH) if bool(wide.any()) else found
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
@@ -356,10 +369,14 @@ class Spectra:
     @functools.cached_property
     def fits(self) -> bool:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
-        vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
-        ends = torch.stack([vergences.min(), vergences.max()])
-        query = self._query(self.imaging, ends, self.wavelengths, self._window(self.imaging, ends))
+        query = self._query(self.imaging, self._ends, self.wavelengths, self._window(self.imaging, self._ends))
         return query is None or _inside(query)
+
+    @functools.cached_property
+    def _ends(self) -> Tensor:
+        """The vergences of what is farthest, and nearest, (2,)."""
+        vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
+        return torch.stack([vergences.min(), vergences.max()])
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
         if not isinstance(lens := imaging.lens, Lens):
@@ -439,6 +456,12 @@ def _compressed(scene: Scene) -> Scene:
 def _inside(query: Query) -> bool:
     """Whether all rays fall well inside the window."""
     return float(query.displacement.max()) < (min(query.shape) // 2 - _AROUND) * query.pixel_pitch
+
+
+def _lights(light: Tensor) -> Tensor:
+    """How many pixels have most of the energy of each (B, 1, H, W): (B,), from 1 on."""
+    energies = light.double().flatten(1).cpu().square()
+    return (energies.sum(1).square() / energies.square().sum(1).clamp(min=1e-300)).clamp(min=1)
 
 
 def linear(camera: Camera) -> bool:
