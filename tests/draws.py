@@ -15,6 +15,9 @@ class Draw:
     def number(self, low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64))
 
+    def whole(self, low: int, high: int) -> int:
+        return int(torch.randint(low, high + 1, (), generator=self.generator))
+
     def one_of(self, *choices):
         return choices[int(torch.randint(len(choices), (), generator=self.generator))]
 

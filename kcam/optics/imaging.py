@@ -26,7 +26,8 @@ from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.regions import zones
 from kcam.optics.rendering.borders import BORDERS
-from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, layer_shares, layer_vergences, present, warn_of_few
+from kcam.optics.rendering.depth import LAYER_WAVES, Layers, alike, layer_shares, layer_vergences, places, warn_of_few
+from kcam.optics.rendering.place import Place
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.optics.source import Defocus, FieldPSFs, PixelGrid, Points, PSFSource, is_field_source, is_source
@@ -403,16 +404,19 @@ class Imaging(Stage):
         if vergences.numel() == 1:
             return vergences, None
         shares = layer_shares(1 / depth, vergences, interpolate=self.accuracy.interpolate).to(planes)
-        filled = present(1 / depth, vergences, interpolate=self.accuracy.interpolate)
-        return vergences[filled.to(vergences.device)], shares[:, filled.to(shares.device)]
+        found = places(1 / depth, vergences, interpolate=self.accuracy.interpolate)
+        filled = [layer for layer, place in enumerate(found) if place is not None]
+        return vergences[filled], shares[:, filled]
 
-    def filled(self, scene: Scene) -> Tensor:
-        """Vergences of the layers in which there is anything, (Z,) [1/m]."""
+    def filled(self, scene: Scene) -> tuple[Tensor, list[Place]]:
+        """Vergences of the layers in which there is anything, (Z,) [1/m], and where each is; [] for one layer."""
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=scene.coefficients.device)
         vergences = self.vergences(scene, depth)
         if depth.ndim < 2 or vergences.numel() == 1:
-            return vergences
-        return vergences[present(1 / depth, vergences, interpolate=self.accuracy.interpolate).to(vergences.device)]
+            return vergences, []
+        found = places(1 / depth, vergences, interpolate=self.accuracy.interpolate)
+        filled = [layer for layer, place in enumerate(found) if place is not None]
+        return vergences[filled], [place for place in found if place is not None]
 
     def work(
         self,
@@ -420,23 +424,23 @@ class Imaging(Stage):
         *,
         channels: int | None = None,
         apart: int | None = None,
-        known: tuple[Tensor, Tensor] | None = None,
+        known: tuple[Tensor, Tensor, list[Place]] | None = None,
     ) -> Work:
         """What a picture of a scene takes, with new optics: for a filter of so many channels, or for all bands. A lens
         has been traced over its field; apart: pixels between places where `spacing` leaves that to the scene, if known.
-        known: planes of the scene as `working` gives them, and vergences of the layers in which there is anything.
+        known: planes of the scene as `working` gives them, and what `filled` tells of its layers.
         """
         if len(groups_of := alike(scene)) > 1:
             works = [self.work(scene.samples(rows), channels=channels, apart=apart) for rows in groups_of]
             return sum(works[1:], works[0])
-        planes, vergences = (self.working(scene), self.filled(scene)) if known is None else known
+        planes, vergences, where = (self.working(scene), *self.filled(scene)) if known is None else known
         picture, wavelengths, layers = scene.shape[1:], scene.wavelengths, len(vergences)
         window = self.psf_window(wavelengths, vergences=vergences, picture=picture)
         shapes = planes.new_empty(0, device="meta")
         channels = None if layers > 1 and self.accuracy.per_band else channels
         weights = None if channels is None else shapes.new_empty(channels, len(wavelengths))
         renderer = self._renderer(scene, window, weights=weights, like=shapes)
-        own, pixels = PictureWork(planes, renderer, layers, self.accuracy), self.pixels(window, planes)
+        own, pixels = PictureWork(planes, renderer, layers, self.accuracy, where), self.pixels(window, planes)
         if self.varies:
             points = self._traced(picture, vergences, wavelengths).points(pixels)
             return own.over_field(points, apart=apart, mirrored=self.centre is None)

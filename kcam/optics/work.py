@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from kcam.effects import Work
 from kcam.optics.accuracy import Accuracy
 from kcam.optics.field import PROBE, PROBED
+from kcam.optics.rendering.place import Place
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.zones import Axis
 
@@ -22,18 +24,25 @@ _FEW_COLOURS, _COLOURS = 5, 12  # PSFs of more wavelengths are polynomials of th
 class PictureWork:
     """That of a picture of planes (B, K, H, W), at some layers of depth; of all tensors the shapes are enough.
 
-    renderer: of the picture, with the PSFs of one layer. accuracy: what is computed.
+    renderer: of the picture, with the PSFs of one layer. accuracy: what is computed. where: each layer is, if not
+    everywhere.
     """
 
     planes: Tensor
     renderer: Renderer
     layers: int
     accuracy: Accuracy
+    where: Sequence[Place] = ()
 
     def on_axis(self, psfs: Mapping[str, float], *, zones: int) -> Work:
         """With one PSF for all pixels of each zone; psfs: what the optics take to compute theirs, of all layers."""
         first, renderer = self._factored
-        rendering, bank = self._rendering(renderer), 0.0
+        batch, reached = len(self.planes), defaultdict[int, float](float)
+        for place in self.where:
+            items, share = renderer.reached(place, batch=batch)
+            reached[items] += share
+        parts = [self._rendering(renderer, n, batch=items) for items, n in (reached or {batch: self.layers}).items()]
+        rendering, bank = sum(parts, Work()), 0.0
         operations = {**rendering.operations, "layer": float(self.layers)}
         if self.accuracy.blur:
             at_once = min(self.layers, renderer.at_once)
@@ -61,7 +70,9 @@ class PictureWork:
         computed = (places + tried) * float(min(groups, _COLOURS)) + colours
         sides = [min(n, math.ceil(2 * n / max(1, k - 1))) for n, k in zip(picture, nodes, strict=True)]
         border = "dark" if layers == 1 else "zero"
-        zone = self._rendering(replace(renderer, border=border, picture=(sides[0], sides[1])))
+        zone = self._rendering(
+            replace(renderer, border=border, picture=(sides[0], sides[1])), layers, batch=len(self.planes)
+        )
         operations = {kind: n * (zones + tried) for kind, n in zone.operations.items()}
         operations |= {"field": 1.0, "layer": float(layers * zones)}
         operations |= {"field psf": layers * computed, "field point": layers * points * computed}
@@ -79,11 +90,11 @@ class PictureWork:
         memory = self.planes.element_size() * touched / count
         return Work({"touch": touched}, memory), replace(self.renderer, spectra=spectra)
 
-    def _rendering(self, renderer: Renderer) -> Work:
-        """That of all layers, with one PSF each."""
-        one = renderer.work(batch=len(self.planes), coverage=self.layers > 1 and self.accuracy.occlusion)
+    def _rendering(self, renderer: Renderer, layers: float, *, batch: int) -> Work:
+        """That of so many layers that are everywhere in a batch, with one PSF each."""
+        one = renderer.work(batch=batch, coverage=self.layers > 1 and self.accuracy.occlusion)
         scale = self.planes.element_size() / 4  # twice as many bytes take twice as long
-        return Work({kind: number * self.layers * scale for kind, number in one.operations.items()}, one.memory)
+        return Work({kind: number * layers * scale for kind, number in one.operations.items()}, one.memory)
 
     def _bytes(self, count: int) -> float:
         """Of so many PSFs at all wavelengths, while they are made."""

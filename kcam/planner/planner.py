@@ -15,6 +15,8 @@ from kcam.camera import Camera
 from kcam.context import Context, Stage
 from kcam.effects import Skippable, Work
 from kcam.optics import Imaging
+from kcam.optics.imaging import is_deep
+from kcam.optics.rendering.place import Place
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
@@ -24,8 +26,10 @@ from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.random_stage import RandomStage
 from kcam.threads import no_more_than_free
 
-WORTH = 0.4
-"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves: measured."""
+WORTH, WORTH_DEEP = 0.2, 0.4
+"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and with a
+map of depth; each picture of a batch adds a sixteenth: measured.
+"""
 
 SENSOR = "sensor"
 """The tolerance that follows from what a sensor records."""
@@ -91,7 +95,7 @@ def shoot(
     planner = Planner(camera, scene, one=True)
     plan = planner.plan(tolerance if planner.pays else 0)
     stages = list(camera)
-    if planner.evaluator.index is not None and planner.evaluator.imaging is not None:
+    if plan.changes and planner.evaluator.index is not None and planner.evaluator.imaging is not None:
         stages[planner.evaluator.index] = planner.evaluator.imaging
     short = shortened(Camera(*stages, context=camera.context), plan.changes, plan.shortcuts)
     return short(scene, generator=generator), dataclasses.replace(plan, tolerance=tolerance)
@@ -130,7 +134,9 @@ class Planner:
         imaging = self.evaluator.imaging
         if imaging is None or self.evaluator.varies:
             return False
-        return self.prices.of({})[0] > WORTH
+        scene = self.prices.scene
+        worth = WORTH_DEEP if is_deep(scene) else WORTH
+        return self.prices.of({})[0] > worth * (1 + scene.shape[0] / 16)
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:
@@ -389,7 +395,7 @@ class _Prices:
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
-        self.known: dict[tuple[Any, ...], tuple[torch.Tensor, torch.Tensor]] = {}
+        self.known: dict[tuple[Any, ...], tuple[torch.Tensor, torch.Tensor, list[Place]]] = {}
         self.scene = scenes[0]
         if len(scenes) > 1:
             self.scene = max(scenes, key=lambda scene: self._seconds(scene))
@@ -435,7 +441,7 @@ class _Prices:
         if torch.as_tensor(scene.depth).ndim != 1:  # else each distance is a picture of its own
             key = id(scene), imaging.layers, imaging.interpolate, imaging.blur, imaging.precision
             if key not in self.known:
-                self.known[key] = imaging.working(scene), imaging.filled(scene)
+                self.known[key] = imaging.working(scene), *imaging.filled(scene)
             known = self.known[key]
         return imaging.work(scene, channels=self.channels, apart=self.apart, known=known)
 

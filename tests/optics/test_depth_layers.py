@@ -13,7 +13,8 @@ from torch import Tensor
 
 from kcam import Camera, optics
 from kcam.context import Context
-from kcam.optics.rendering.depth import layer_shares
+from kcam.optics.rendering.depth import Layers, layer_shares
+from kcam.optics.rendering.renderer import Renderer
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 from kcam.units import mm, um, wavelength_grid
@@ -330,3 +331,91 @@ def test_gradients_of_coverage_per_band() -> None:
         return stage(Scene(planes, wavelengths=scene.wavelengths, depth=scene.depth), colour_filter=colours)
 
     assert torch.autograd.gradcheck(picture, scene.coefficients.clone().requires_grad_())
+
+
+# ---- where a layer is --------------------------------------------------------------------------------------------
+
+
+def scattered(draw: Draw) -> tuple[Tensor, Tensor, Renderer, bool]:
+    """Planes and shares of layers that are in few places of few items, PSFs of them, and whether they hide."""
+    batch, count, layers = draw.one_of(1, 2, 5), draw.one_of(1, 3), draw.one_of(2, 4)
+    height, width = draw.whole(20, 70), draw.whole(20, 70)
+    depth = torch.zeros(batch, 1, height, width, dtype=torch.float64)
+    for item in range(batch):
+        depth[item] = draw.number(0, layers - 1)  # between two layers, all over
+        for _ in range(draw.whole(0, 2)):
+            top, left = draw.whole(0, height - 6), draw.whole(0, width - 6)
+            depth[item, :, top : top + draw.whole(1, 6), left : left + draw.whole(1, 6)] = draw.whole(0, layers - 1)
+    shares = layer_shares(depth, torch.arange(layers, dtype=torch.float64))
+    window = (draw.whole(1, 15), draw.whole(1, 15))
+    psfs = draw.noise(layers, 2, *window).abs() + 0.01
+    renderer = Renderer(
+        psfs / psfs.sum((-2, -1), keepdim=True),
+        spectra=draw.noise(count, 2).abs(),
+        weights=draw.noise(3, 2).abs(),
+        picture=(height, width),
+        border=draw.one_of("reflect", "replicate", "zero", "periodic"),
+        direct=draw.one_of(True, False, False),
+        tile=draw.one_of(None, None, 16),
+    )
+    return draw.noise(batch, count, height, width).abs(), shares, renderer, draw.one_of(True, False)
+
+
+def laid(planes: Tensor, shares: Tensor, renderer: Renderer, *, occlusion: bool) -> Tensor:
+    layers = Layers(planes, shares, occlusion=occlusion)
+    layers.add(renderer, first=0)
+    return layers.light
+
+
+@pytest.mark.parametrize("seed", [*range(20), *(pytest.param(n, marks=pytest.mark.slow) for n in range(20, 200))])
+def test_layers_are_rendered_where_they_are(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light, and its gradient to planes and PSFs, are those of layers that are rendered everywhere."""
+    planes, shares, renderer, occlusion = scattered(Draw(seed))
+    given = planes.requires_grad_(), renderer.psfs.requires_grad_()
+    probe, found = Draw(seed).noise(1), []
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(Renderer, "near", lambda *args, **kwargs: None)
+        light = laid(planes, shares, renderer, occlusion=occlusion)
+        found.append([light.detach(), *torch.autograd.grad((light * torch.cos(7 * light * probe)).sum(), given)])
+        with torch.no_grad():
+            torch.testing.assert_close(
+                laid(planes, shares, renderer, occlusion=occlusion), light, rtol=1e-12, atol=1e-12
+            )
+    for near, everywhere in zip(*found, strict=True):
+        torch.testing.assert_close(near, everywhere, rtol=1e-9, atol=1e-9 * float(everywhere.abs().max()))
+
+
+def test_a_layer_is_rendered_for_the_items_and_the_part_that_it_is_in() -> None:
+    shares = torch.zeros(4, 2, 64, 64)
+    shares[:, 0], shares[1, 1, 20:24, 30:40] = 1, 1
+    shares[1, 0, 20:24, 30:40] = 0
+    renderer = Renderer(torch.ones(2, 1, 5, 5) / 25, spectra=None, weights=None, picture=(64, 64))
+    (whole, part) = Layers(torch.ones(4, 1, 64, 64), shares)._places or ()
+    assert whole is not None
+    assert renderer.near(whole, batch=4) is None
+    assert part is not None
+    assert part.items == (1,)
+    near = renderer.near(part, batch=4)
+    assert near is not None
+    assert near.picture == (4 + 4, 10 + 4)
+    items, share = renderer.reached(part, batch=4)
+    assert items == 1
+    assert share < 0.1
+
+
+def test_a_batch_of_distances_takes_what_its_pictures_take() -> None:
+    """Each picture's map is in layers of its own, of which the others have nothing."""
+    depth = torch.linspace(0.5, 2.0, 6)[:, None, None, None].expand(6, 1, 32, 32).clone()
+    depth[..., 16:] *= 1.01
+    scene = Scene(Draw(1).noise(6, BANDS, 32, 32).abs(), wavelengths=wavelength_grid(count=BANDS), depth=depth)
+    stage = optics.Imaging(random_lens(Draw(1), "ideal"), pixel_pitch=4 * um)
+    together = stage.work(scene).operations["transform"]
+    alone = sum(stage.work(scene.samples([row])).operations["transform"] for row in range(6))
+    assert together < 1.5 * alone
+    with torch.no_grad():
+        light = stage(scene)
+        for row in range(6):
+            one = scene.samples([row])
+            layers = tuple((1 / stage.depth_layers(depth, scene.wavelengths)).tolist())
+            torch.testing.assert_close(light[row : row + 1], stage.changed(layers=layers)(one), rtol=1e-5, atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -9,8 +10,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from kcam.cache import differentiated
+from kcam.cache import differentiated, has_derivative
 from kcam.optics.numerics import bracketed
+from kcam.optics.rendering.place import Place
 from kcam.optics.rendering.renderer import Renderer
 from kcam.scene import Scene
 
@@ -95,13 +97,16 @@ def _positions(vergence: Tensor, layers: Tensor, *, interpolate: bool) -> Tensor
     return position if interpolate else position.round()
 
 
-def present(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
-    """In which layers there is anything, (Z,) bool, without the shares. Args: as of `layer_shares`."""
-    position = _positions(vergence.detach(), layers, interpolate=interpolate).flatten()
-    found = torch.zeros(layers.numel(), dtype=torch.bool, device=position.device)
-    for one in (position.floor(), position.ceil()):
-        found[one.long()] = True
-    return found.cpu()
+def places(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> list[Place | None]:
+    """Where there is anything in each layer, without the shares. Args: as of `layer_shares`."""
+    position = _positions(vergence.detach(), layers, interpolate=interpolate)[:, 0]
+    sides = []
+    for own in (position, position.mT):
+        filled = torch.zeros(*own.shape[:2], layers.numel(), dtype=torch.bool, device=own.device)
+        for one in (own.floor(), own.ceil()):
+            filled.scatter_(-1, one.long(), True)
+        sides.append(filled.cpu())
+    return [Place.of(*(side[..., layer] for side in sides)) for layer in range(layers.numel())]
 
 
 def warn_of_few(layers: object, nodes: Tensor, *, vergence: Tensor, defocus_waves: float) -> None:
@@ -133,7 +138,8 @@ class Layers:
     that the sum over wavelengths stays inside the transform. Dividing by E_k, the share of what is not hidden by nearer
     layers, extends each layer behind those, whose blurred edge would otherwise show black. The nearest layer has
     E = 1: its blurred mask covers what is behind. Where all layers share one PSF this is exactly the plain
-    convolution. Without occlusion the layers are added up as they are.
+    convolution. Without occlusion the layers are added up as they are. Where a layer does not reach nothing changes: it
+    is rendered in the part of the picture, and for the items of a batch, where it is seen.
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
     """
 
@@ -143,18 +149,59 @@ class Layers:
         self._unhidden = planes.new_zeros(())  # pixels that lie in the layers so far
 
     def add(self, renderer: Renderer, *, first: int) -> None:
-        """Lay the layers of one bank of PSFs, `first` and the following, over those before."""
+        """Lay the layers of one bank of PSFs, `first` and the following, over those before: each only where it is."""
         if self.shares is None:
             self.light = renderer.blur(self.planes, layer=0)
             return
         for layer in range(renderer.psfs.shape[0]):
             share = self.shares[:, first + layer : first + layer + 1]
-            light = renderer.blur(self.planes * share, layer=layer)
-            if not self.occlusion:
-                self.light = self.light + light
+            if self.occlusion:
+                self._unhidden = self._unhidden + share
+            place = None
+            if self._places is not None and (place := self._places[first + layer]) is None:
                 continue
-            self._unhidden = self._unhidden + share
-            cover, unhidden = renderer.coverage(torch.cat([share, self._unhidden]), layer=layer).chunk(2)
-            floor = unhidden.clamp(min=_COVERAGE_FLOOR)
-            opacity = (cover / floor).clamp(0, 1)
-            self.light = light / floor + (1 - opacity) * self.light
+            near = None if place is None else renderer.near(place, batch=len(share))
+            if place is None or near is None:
+                self.light = self._over(self.light, renderer, layer, self.planes, share, self._unhidden)
+            else:
+                self._lay(layer, share, place, renderer, near)
+
+    @functools.cached_property
+    def _places(self) -> list[Place | None] | None:
+        """Where each layer is; None where a derivative goes through what is empty, too, or nothing is computed yet."""
+        shares = self.shares
+        if shares is None or torch.compiler.is_compiling() or has_derivative((shares,)):
+            return None
+        sides = (torch.stack([(one != 0).any(dim) for one in shares.unbind(1)]).cpu() for dim in (-1, -2))
+        return [Place.of(*both) for both in zip(*sides, strict=True)]
+
+    def _lay(self, layer: int, share: Tensor, place: Place, renderer: Renderer, near: Renderer) -> None:
+        """A layer where it is alone."""
+        (top, bottom), (left, right) = place.box(renderer.window, renderer.picture)
+        items = slice(None) if len(place.items) == len(share) else list(place.items)
+        of_masks = [share, self._unhidden] if self.occlusion else [share]
+        planes = renderer.around(self.planes[items], place)
+        masks = (renderer.around(mask[items], place, masks=True) for mask in of_masks)
+        if self.light.ndim == 0:
+            self.light = planes.new_zeros(len(share), renderer.channels, *renderer.picture)
+        whole = self.light[items]
+        own = self._over(whole[..., top:bottom, left:right], near, layer, planes, *masks)
+        if not has_derivative((own, self.light)):
+            self.light[items, :, top:bottom, left:right] = own
+            return
+        rows = whole[..., top:bottom, :].slice_scatter(own, -1, left, right)
+        whole = whole.slice_scatter(rows, -2, top, bottom)
+        everywhere = isinstance(items, slice)
+        self.light = whole if everywhere else self.light.index_copy(0, torch.tensor(items).to(own.device), whole)
+
+    def _over(
+        self, behind: Tensor, renderer: Renderer, layer: int, planes: Tensor, share: Tensor, *rest: Tensor
+    ) -> Tensor:
+        """What is seen of a layer, of masks and planes with what lies around them, over what is behind it."""
+        light = renderer.blur(planes * share, layer=layer)
+        if not self.occlusion:
+            return behind + light
+        cover, unhidden = renderer.coverage(torch.cat([share, *rest]), layer=layer).chunk(2)
+        floor = unhidden.clamp(min=_COVERAGE_FLOOR)
+        opacity = (cover / floor).clamp(0, 1)
+        return light / floor + (1 - opacity) * behind

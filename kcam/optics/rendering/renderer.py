@@ -9,10 +9,15 @@ import torch
 from torch import Tensor
 
 from kcam.effects import Work
+from kcam.optics.numerics import fast_length
+from kcam.optics.rendering.borders import part
 from kcam.optics.rendering.convolution import correlate
+from kcam.optics.rendering.place import Place
 from kcam.optics.rendering.ways import Bank, choose
 
 _NEAR = 2**20  # pixels beyond which a plane is no longer near the processor
+_CUT = ("reflect", "replicate", "zero")  # borders beyond which is only what lies near them
+_SAVED = 0.8  # of the work for a layer: less of it is worth cutting out where it is
 
 
 class Renderer(Bank):
@@ -34,6 +39,37 @@ class Renderer(Bank):
             return correlate(bank.extend(share), kernels[:, None])
         convolution, transfers = bank.convolution, bank.convolution.transfer(kernels)
         return bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
+
+    def near(self, place: Place, *, batch: int) -> Renderer | None:
+        """The renderer of what a layer reaches from its place, to which `around` brings what lies around; None where
+        that takes about as long as the whole.
+        """
+        if self.reached(place, batch=batch) == (batch, 1):
+            return None
+        (top, bottom), (left, right) = place.box(self.window, self.picture)
+        return replace(self, picture=(bottom - top, right - left), border="given", cache=None)
+
+    def around(self, planes: Tensor, place: Place, *, masks: bool = False) -> Tensor:
+        """Planes (..., H, W), or masks, in what a layer reaches from its place, with what lies around."""
+        border = self._of_masks.border if masks else self.border
+        for dim, (start, stop), m in zip((-2, -1), place.box(self.window, self.picture), self.window, strict=True):
+            planes = part(planes, start - m // 2, stop + (m - 1) // 2, border, dim=dim)
+        return planes
+
+    def reached(self, place: Place, *, batch: int) -> tuple[int, float]:
+        """How many pictures of a batch a layer is rendered in, and in what share of each: where it is, or in all of
+        them where little would be saved.
+        """
+        if self.border not in _CUT:
+            return batch, 1.0
+        sides = [stop - start for start, stop in place.box(self.window, self.picture)]
+        if self.direct:
+            share = math.prod(sides) / math.prod(self.picture)
+        else:
+            points = math.prod(fast_length(n + m - 1) for n, m in zip(sides, self.window, strict=True))
+            share = points / (math.prod(self.sizes.size) * math.prod(self.squares))
+        items = len(place.items)
+        return (items, min(1.0, share)) if items * share < _SAVED * batch else (batch, 1.0)
 
     @property
     def at_once(self) -> int:

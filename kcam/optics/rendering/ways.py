@@ -40,7 +40,7 @@ class Bank:
     weights: Tensor | None  # (C, L) of the channels, or None for all bands
     picture: tuple[int, int]
     shares: Tensor | None = None  # (L, G) of the PSFs in that of each band; None where each has its own
-    border: str = "reflect"  # what lies beyond the picture, one of `BORDERS`
+    border: str = "reflect"  # what lies beyond the picture, one of `BORDERS`; or "given", where that comes with it
     direct: bool = False  # sum over the window instead of by FFT; with the same result, faster for small windows
     tile: int | None = None  # side of squares that the picture is cut into [pixels]; None: those of a large one
     max_memory: float = 2e9  # bytes that the transforms may take
@@ -74,7 +74,7 @@ class Bank:
 
     def extend(self, planes: Tensor) -> Tensor:
         """The picture with the border that the window reaches."""
-        return extend(planes, self.window, self.border)
+        return planes if self.border == "given" else extend(planes, self.window, self.border)
 
     def of_bands(self, psfs: Tensor) -> Tensor:
         """The PSF of each band, (L, h, w)."""
