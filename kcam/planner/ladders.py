@@ -113,7 +113,7 @@ class Ladder:
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
     roughly: dict[tuple[int, int], float] = field(default_factory=dict)
-    colours: dict[tuple[int, int], float] = field(default_factory=dict)
+    grey: dict[tuple[int, int], float] = field(default_factory=dict)
     compared: set[tuple[int, int]] = field(default_factory=set)
 
     @property
@@ -128,11 +128,14 @@ class Ladder:
 
     @property
     def error(self) -> float:
-        """Estimated, of the rung that it stands on; what is known roughly alone as large as it may be."""
+        """Estimated, of the rung that it stands on: what is known roughly alone is as large as it may be, and at one
+        wavelength as large as it is at least.
+        """
         key = self._key(self.position)
         if self.at_top:
             return 0.0
-        return max(self.errors[key], self.least) if key in self.errors else self.off_by * self.roughly[key]
+        known = self.errors if key in self.errors else self.grey
+        return max(known[key], self.least) if key in known else self.off_by * self.roughly[key]
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -163,18 +166,17 @@ class Ladder:
         elif self.successive:
             self.errors[key] = self._beyond(evaluator)
         elif self.from_top:
-            self.levels[self.position], error = self._best(evaluator, self.position, **GREY)
-            self.errors[key] = error * self._colours(evaluator)
+            if key not in self.grey:
+                self.levels[self.position], self.grey[key] = self._best(evaluator, self.position, **GREY)
+            if self.grey[key] <= most:
+                self.errors[key] = self.grey[key] * self._colours(evaluator)
         elif self.off_by == 1 or not self._settled(self._roughly(evaluator, self.position), most):
             self.levels[self.position], self.errors[key] = self._best(evaluator, self.position)
 
     def _colours(self, evaluator: Evaluator) -> float:
-        """By how much an error at one wavelength is too small, roughly, of the rung below the top."""
-        last = len(self.levels) - 2
-        if (key := self._key(last)) not in self.colours:
-            grey = self._best(evaluator, last, roughly=True, **GREY)[1]
-            self.colours[key] = max(1.0, self._roughly(evaluator, last) / grey) if grey else 1.0
-        return self.colours[key]
+        """By how much the error of the rung that it stands on is too small at one wavelength, roughly."""
+        grey = self._best(evaluator, self.position, roughly=True, **GREY)[1]
+        return max(1.0, self._roughly(evaluator, self.position) / grey) if grey else 1.0
 
     def _best(
         self, evaluator: Evaluator, position: int, *, roughly: bool = False, **settings: Any
@@ -244,7 +246,7 @@ class Ladder:
         """The number that decided."""
         if self.position == 0:
             return "" if len(self.levels) == 1 else "the least there is suffices"
-        known = self.roughly | self.errors
+        known = self.roughly | self.grey | self.errors
         below = max(key for key in known if key[0] < self.position)
         return f"{self.levels[below[0]].label} would cost {known[below]:.2g}"
 
