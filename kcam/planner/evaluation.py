@@ -100,13 +100,17 @@ class Evaluator:
         self.gradients = torch.is_grad_enabled() and bool(self.parameters)
         self.defocus = Defocus() if self.imaging is None else self.imaging.defocus(scenes[0].wavelengths)
         full = [scene for scene in scenes if scene.coefficients.numel()]
-        self.surveys = [survey(scene, self.raw_camera, self.defocus) for scene in full]
         self.varies = self.imaging is not None and self.imaging.varies
         self.whole = any(getattr(stage, "only_whole", False) for stage in stages)  # a map of the picture is of no crop
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
         self.scenes = full
         self.signals: list[dict[int, tuple[Tensor, Context]]] = []
         self.spectra: list[Spectra] | None = None
+
+    @functools.cached_property
+    def surveys(self) -> list[list[Survey]]:
+        """Of each scene, what was seen of its items."""
+        return [survey(scene, self.raw_camera, self.defocus) for scene in self.scenes]
 
     @functools.cached_property
     def samples(self) -> list[Sample]:

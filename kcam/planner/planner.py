@@ -179,7 +179,7 @@ class Planner:
             stages=tuple(type(stage).__name__ for stage in self.camera),
             range=Range.of(
                 self.scenes,
-                self.evaluator.items,
+                self.evaluator.items if tolerance != 0 else (),  # the reference is right for every scene
                 self.evaluator.defocus,
                 varies=self.evaluator.varies,
             ),
