@@ -15,7 +15,7 @@ from typing import Any, Protocol, Unpack
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, has_derivative
+from kcam.cache import ValueCache, differentiated, has_derivative
 from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
@@ -404,19 +404,20 @@ class Imaging(Stage):
         if vergences.numel() == 1:
             return vergences, None
         shares = layer_shares(1 / depth, vergences, interpolate=self.accuracy.interpolate).to(planes)
-        found = places(1 / depth, vergences, interpolate=self.accuracy.interpolate)
-        filled = [layer for layer, place in enumerate(found) if place is not None]
-        return vergences[filled], shares[:, filled]
+        filled = shares.detach().amax((0, 2, 3)) > 0
+        return vergences[filled.to(vergences.device)], shares[:, filled]
 
     def filled(self, scene: Scene) -> tuple[Tensor, list[Place]]:
-        """Vergences of the layers in which there is anything, (Z,) [1/m], and where each is; [] for one layer."""
+        """Vergences of the layers in which there is anything, (Z,) [1/m], and where each is; [] where it is rendered
+        everywhere: one layer, and maps with a derivative.
+        """
         depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=scene.coefficients.device)
         vergences = self.vergences(scene, depth)
         if depth.ndim < 2 or vergences.numel() == 1:
             return vergences, []
         found = places(1 / depth, vergences, interpolate=self.accuracy.interpolate)
         filled = [layer for layer, place in enumerate(found) if place is not None]
-        return vergences[filled], [place for place in found if place is not None]
+        return vergences[filled], [] if differentiated(depth) else [place for place in found if place is not None]
 
     def work(
         self,
@@ -592,7 +593,7 @@ class Imaging(Stage):
 
     @torch.no_grad()
     def _outermost(self, scene: Scene) -> tuple[Tensor, FieldPSFs]:
-        vergences, _ = self.layers_of(scene, self.working(scene))
+        vergences, _ = self.filled(scene)
         _, height, width = scene.shape
         sides = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64) * self.pixel_pitch
         places = torch.cartesian_prod(sides * width, sides * height) + torch.tensor(self._middle, dtype=torch.float64)

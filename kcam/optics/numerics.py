@@ -16,7 +16,6 @@ from torch import Tensor
 Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
 
 
-@functools.lru_cache(maxsize=4096)
 def fast_length(minimum: int) -> int:
     """The smallest length >= `minimum` that FFTs like: no prime factor above 7, a multiple of 32 from 256 up."""
     step = 32 if minimum >= 256 else 2 if minimum > 2 else 1

@@ -37,9 +37,10 @@ class PictureWork:
     def on_axis(self, psfs: Mapping[str, float], *, zones: int) -> Work:
         """With one PSF for all pixels of each zone; psfs: what the optics take to compute theirs, of all layers."""
         first, renderer = self._factored
-        batch, reached = len(self.planes), defaultdict[int, float](float)
+        batch = len(self.planes)
+        reached: dict[int, float] = defaultdict(float)
         for place in self.where:
-            items, share = renderer.reached(place, batch=batch)
+            items, share = renderer.reached(place, batch=batch) or (batch, 1.0)
             reached[items] += share
         parts = [self._rendering(renderer, n, batch=items) for items, n in (reached or {batch: self.layers}).items()]
         rendering, bank = sum(parts, Work()), 0.0

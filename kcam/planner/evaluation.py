@@ -48,6 +48,7 @@ CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixe
 WITNESSED = 2**20  # pixels of the last trial
 NOTHING: Shortcuts = {}
 CUT = 1.01  # RMS of light over that of what the full well leaves of it, from which on that matters
+LOOKED = 129  # side of the PSFs with which the light is looked at, where these hold most of it: wide ones take long
 HARDLY = 3e-3  # RMS of light that may be hidden, of what is recorded, that is taken for what it changes at most
 
 
@@ -132,7 +133,6 @@ class Evaluator:
         few = {**settings, "bands": 1, "occlusion": False}  # it moves little of the light, and takes half of the time
         if "layers" in few and not any(bool(one.potential[BEYOND].any()) for one in self.items):
             few["layers"] = 1
-        self.signals = self._signals(few)
         if self.imaging is not None and not self.gradients and not self.varies and linear(self.raw_camera):
             self.spectra = [
                 Spectra.of(
@@ -140,8 +140,12 @@ class Evaluator:
                 )
                 for sample in self.samples
             ]
-            if not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
-                self.spectra = None
+            narrow = [window for one in self.spectra if (window := one.narrow(few, LOOKED))]
+            if narrow and len(narrow) == len(self.spectra):
+                few |= {"psf_shape": max(narrow), "renormalise": True}
+        self.signals = self._signals(few)
+        if self.spectra and not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
+            self.spectra = None
 
     def _compare(self, settings: Mapping[str, Any]) -> bool:
         """What spectra say of the light with what was seen of it, where nothing but colours lies between; whether they

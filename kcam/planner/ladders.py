@@ -60,9 +60,6 @@ CANCELLED = {torch.float32: 2e-5, torch.float64: 1e-13}
 ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 """By which two ways to the same picture differ."""
 
-LOOKED = 129
-"""Side of the PSFs with which the light is looked at, at most [pixels]: wide ones take long."""
-
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
 LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
 KAPPAS = (1.3, 1.7, 2.1)
@@ -304,12 +301,8 @@ class _View:
 
     @property
     def coarse(self) -> dict[str, Any]:
-        """The coarsest grid and a window of some size, which do for what only looks at the light."""
-        found: dict[str, Any] = {"kappa": KAPPAS[0]} if self.on_grid else {}
-        sides = self.beside.get("psf_shape", self.window)
-        if self.computed and self.apart is None and max(sides) > LOOKED:
-            found |= {"psf_shape": (min(sides[0], LOOKED), min(sides[1], LOOKED)), "renormalise": True}
-        return found
+        """The coarsest grid, which does for what only looks at the light."""
+        return {"kappa": KAPPAS[0]} if self.on_grid else {}
 
     def places(self, apart: float) -> tuple[int, int]:
         """Rows and columns of places so far apart at most [pixels]."""

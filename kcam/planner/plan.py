@@ -514,7 +514,7 @@ def together(errors: Iterable[float]) -> float:
     (0.01, 0.0159)
     """
     found = [error for error in errors if error]
-    return sum(error**ALIKE for error in found) ** (1 / ALIKE) if len(found) > 1 else sum(found)
+    return math.fsum(error**ALIKE for error in found) ** (1 / ALIKE) if len(found) > 1 else math.fsum(found)
 
 
 def shares(values: Tensor) -> Tensor:

@@ -311,7 +311,7 @@ def _relevant(steps: Sequence[Ladder]) -> list[Ladder]:
 
 
 def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator, most: float) -> None:
-    """One rung at a time, on the ladder with the largest error, until their sum fits; those that follow others last."""
+    """One rung at a time, on the ladder with the largest error, until all together fit; followers last."""
     movable: list[Any] = [skip for skip in skips if skip.counted]
     while True:
         relevant: list[Any] = [*_relevant(steps), *movable]
@@ -367,16 +367,16 @@ class _Skip:
 
 
 def _shortcuts(skips: Sequence[_Skip], allowed: float, noise: float | None) -> dict[int, dict[str, Any] | None]:
-    """Stages to leave out or to replace: by those whose errors are in the sum; noise and rounding that are small by
+    """Stages to leave out or to replace: by those whose errors count; noise and rounding that are small by
     themselves are left out.
 
     Together they stay below the tolerance; where the noise itself sets it, each source below a tenth of it.
     """
     chosen = {skip.index: skip.forms[skip.position][1] for skip in skips if skip.counted and not skip.at_top}
-    together = 0.0
+    left_out = 0.0
     for skip in sorted((skip for skip in skips if not skip.counted), key=lambda skip: skip.error):
-        together = math.hypot(together, skip.error)
-        if together <= (allowed if noise is None else NOISE_SHARE * noise):
+        left_out = math.hypot(left_out, skip.error)
+        if left_out <= (allowed if noise is None else NOISE_SHARE * noise):
             chosen[skip.index] = None
     return chosen
 

@@ -50,9 +50,10 @@ WINDOW = {"psf_shape", "renormalise"}
 
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _HIDDEN_LIGHTS = 1.5  # the same of few lights, and of PSFs that are cut off
-_SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture: the little seen of it is much
+_SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture, and what is behind it is not
 _CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
+_MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -172,6 +173,28 @@ class Spectra:
         """Whether transfer functions of all wavelengths are known at once."""
         return all(table or self._lines(*asked) for table, asked in self._at_once(settings))
 
+    def narrow(self, settings: Mapping[str, Any], side: int) -> tuple[int, int] | None:
+        """The middle of wide windows, so many pixels at most, where that holds most of the light with some settings, as
+        far as it is known without PSFs.
+        """
+        imaging, found = self.imaging.changed(**settings), (0, 0)
+        wavelengths = imaging.psf_wavelengths(self.wavelengths, deep=is_deep(self.scene))
+        for index in range(len(self.groups)):
+            vergences = self._of(index, settings.get("layers")).vergences
+            window = self._window(imaging, vergences)
+            if max(window) <= side:
+                return None
+            found = min(side, window[0]), min(side, window[1])
+            own = imaging.changed(psf_shape=found)
+            known = self._table(own, vergences, wavelengths) or self._lines(own, vergences, wavelengths)
+            if known is None:
+                return None
+            places = [known.wavelengths.index(one) for one in wavelengths.tolist()]
+            light = known.transfer(self.frequencies[:1], found, places).real.prod(2)  # what either side lets pass
+            if float(light.min()) < _MOST:
+                return None
+        return found
+
     def by_lines(self, settings: Mapping[str, Any]) -> bool:
         """Whether those that are known at once are line spreads."""
         return all(table is None and self._lines(*asked) is not None for table, asked in self._at_once(settings))
@@ -254,8 +277,11 @@ class Spectra:
         patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
         few = torch.minimum(_lights(light), _lights(patches)) < _FEW
         found = torch.where(few | (not self.fits), _HIDDEN_LIGHTS, _HIDDEN).double()
-        wide = defocus.radius(self._ends) - defocus.floor > min(self.picture) / 2
-        return found.fill_(_SEEN_THROUGH) if bool(wide.any()) else found
+        depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
+        ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
+        far, near = (defocus.radius(end) - defocus.floor for end in ends)
+        wide = (near > min(self.picture) / 2) & (far < near / 2)
+        return torch.where(wide, _SEEN_THROUGH, found)
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""

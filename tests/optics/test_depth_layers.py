@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -419,3 +420,22 @@ def test_a_batch_of_distances_takes_what_its_pictures_take() -> None:
             one = scene.samples([row])
             layers = tuple((1 / stage.depth_layers(depth, scene.wavelengths)).tolist())
             torch.testing.assert_close(light[row : row + 1], stage.changed(layers=layers)(one), rtol=1e-5, atol=1e-6)
+
+
+def test_a_zone_without_any_layer_is_dark() -> None:
+    shares = torch.zeros(1, 2, 20, 24)
+    renderer = Renderer(torch.ones(2, 1, 5, 5) / 25, spectra=None, weights=None, picture=(20, 24), border="zero")
+    assert torch.equal(laid(torch.ones(1, 1, 20, 24), shares, renderer, occlusion=True), torch.zeros(1, 1, 20, 24))
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+def test_layers_under_vmap() -> None:
+    planes, shares, renderer, _ = scattered(Draw(3))
+    scales = torch.tensor([1.0, 2.0], dtype=torch.float64)
+
+    def light(scale: Tensor, own: Tensor = shares) -> Tensor:
+        return laid(planes, own, replace(renderer, psfs=renderer.psfs * scale), occlusion=True)
+
+    torch.testing.assert_close(torch.func.vmap(light)(scales), torch.stack([light(one) for one in scales]))
+    both = torch.func.vmap(light)(scales, torch.stack([shares, shares]))
+    torch.testing.assert_close(both, torch.stack([light(one) for one in scales]))

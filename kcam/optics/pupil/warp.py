@@ -121,7 +121,8 @@ def _series(limit: float) -> tuple[Tensor, int]:
     reach = int(np.ceil(_HALF_WIDTH + limit))
     nodes = np.cos(np.pi * (np.arange(2 * _MOST_TERMS) + 0.5) / (2 * _MOST_TERMS))
     values = kaiser_sinc(np.arange(-reach, reach + 1)[:, None] + limit * nodes, half_width=_HALF_WIDTH, beta=_BETA)
-    fitted = scipy.fft.dct(values, axis=1)[:, :_MOST_TERMS].T / len(nodes)  # orthogonal there: as least squares say
+    # Chebyshev polynomials are orthogonal at these nodes: this is the least-squares fit
+    fitted = scipy.fft.dct(values, axis=1)[:, :_MOST_TERMS].T / len(nodes)
     fitted[0] /= 2
     kept = np.nonzero(np.abs(fitted).max(1) > _SMALLEST)[0]
     return torch.as_tensor(fitted[: max(int(kept[-1]) + 1, 2)]), reach

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from kcam.cache import differentiated, has_derivative
+from kcam.cache import differentiated, is_plain
 from kcam.optics.numerics import bracketed
 from kcam.optics.rendering.place import Place
 from kcam.optics.rendering.renderer import Renderer
@@ -139,7 +139,7 @@ class Layers:
     layers, extends each layer behind those, whose blurred edge would otherwise show black. The nearest layer has
     E = 1: its blurred mask covers what is behind. Where all layers share one PSF this is exactly the plain
     convolution. Without occlusion the layers are added up as they are. Where a layer does not reach nothing changes: it
-    is rendered in the part of the picture, and for the items of a batch, where it is seen.
+    is rendered in the part of the picture, and for the items of a batch, where it is seen, but for periodic borders.
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021 (normalised over-compositing).
     """
 
@@ -153,55 +153,51 @@ class Layers:
         if self.shares is None:
             self.light = renderer.blur(self.planes, layer=0)
             return
+        if self.light.ndim == 0:
+            self.light = self.planes.new_zeros(len(self.planes), renderer.channels, *renderer.seen)
         for layer in range(renderer.psfs.shape[0]):
-            share = self.shares[:, first + layer : first + layer + 1]
+            masks = [self.shares[:, first + layer : first + layer + 1]]
             if self.occlusion:
-                self._unhidden = self._unhidden + share
-            place = None
-            if self._places is not None and (place := self._places[first + layer]) is None:
-                continue
-            near = None if place is None else renderer.near(place, batch=len(share))
-            if place is None or near is None:
-                self.light = self._over(self.light, renderer, layer, self.planes, share, self._unhidden)
-            else:
-                self._lay(layer, share, place, renderer, near)
+                self._unhidden = self._unhidden + masks[0]
+                masks.append(self._unhidden)
+            if self._places is None:
+                self.light = self._over(self.light, renderer, layer, self.planes, masks)
+            elif (place := self._places[first + layer]) is not None:
+                self._lay(place, renderer, layer, masks)
 
     @functools.cached_property
     def _places(self) -> list[Place | None] | None:
         """Where each layer is; None where a derivative goes through what is empty, too, or nothing is computed yet."""
-        shares = self.shares
-        if shares is None or torch.compiler.is_compiling() or has_derivative((shares,)):
+        if self.shares is None or not is_plain(self.shares):
             return None
-        sides = (torch.stack([(one != 0).any(dim) for one in shares.unbind(1)]).cpu() for dim in (-1, -2))
+        sides = ((self.shares.amax(dim) > 0).movedim(1, 0).cpu() for dim in (-1, -2))
         return [Place.of(*both) for both in zip(*sides, strict=True)]
 
-    def _lay(self, layer: int, share: Tensor, place: Place, renderer: Renderer, near: Renderer) -> None:
-        """A layer where it is alone."""
+    def _lay(self, place: Place, renderer: Renderer, layer: int, masks: list[Tensor]) -> None:
+        """Lay a layer over the part of the picture that it reaches."""
+        if (near := renderer.near(place, batch=len(self.planes))) is None:
+            self.light = self._over(self.light, renderer, layer, self.planes, masks)
+            return
         (top, bottom), (left, right) = place.box(renderer.window, renderer.picture)
-        items = slice(None) if len(place.items) == len(share) else list(place.items)
-        of_masks = [share, self._unhidden] if self.occlusion else [share]
+        everywhere = len(place.items) == len(self.planes)
+        items = slice(None) if everywhere else list(place.items)
         planes = renderer.around(self.planes[items], place)
-        masks = (renderer.around(mask[items], place, masks=True) for mask in of_masks)
-        if self.light.ndim == 0:
-            self.light = planes.new_zeros(len(share), renderer.channels, *renderer.picture)
+        masks = [renderer.around(mask[items], place, masks=True) for mask in masks]
         whole = self.light[items]
-        own = self._over(whole[..., top:bottom, left:right], near, layer, planes, *masks)
-        if not has_derivative((own, self.light)):
+        own = self._over(whole[..., top:bottom, left:right], near, layer, planes, masks)
+        if is_plain(own) and is_plain(self.light):
             self.light[items, :, top:bottom, left:right] = own
             return
         rows = whole[..., top:bottom, :].slice_scatter(own, -1, left, right)
         whole = whole.slice_scatter(rows, -2, top, bottom)
-        everywhere = isinstance(items, slice)
         self.light = whole if everywhere else self.light.index_copy(0, torch.tensor(items).to(own.device), whole)
 
-    def _over(
-        self, behind: Tensor, renderer: Renderer, layer: int, planes: Tensor, share: Tensor, *rest: Tensor
-    ) -> Tensor:
-        """What is seen of a layer, of masks and planes with what lies around them, over what is behind it."""
-        light = renderer.blur(planes * share, layer=layer)
+    def _over(self, behind: Tensor, renderer: Renderer, layer: int, planes: Tensor, masks: list[Tensor]) -> Tensor:
+        """What is seen of a layer over what is behind it; masks: its own, and of what nothing has hidden so far."""
+        light = renderer.blur(planes * masks[0], layer=layer)
         if not self.occlusion:
             return behind + light
-        cover, unhidden = renderer.coverage(torch.cat([share, *rest]), layer=layer).chunk(2)
+        cover, unhidden = renderer.coverage(torch.cat(masks), layer=layer).chunk(2)
         floor = unhidden.clamp(min=_COVERAGE_FLOOR)
         opacity = (cover / floor).clamp(0, 1)
         return light / floor + (1 - opacity) * behind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from kcam.optics.rendering.ways import Bank, choose
 _NEAR = 2**20  # pixels beyond which a plane is no longer near the processor
 _CUT = ("reflect", "replicate", "zero")  # borders beyond which is only what lies near them
 _SAVED = 0.8  # of the work for a layer: less of it is worth cutting out where it is
+_length = functools.lru_cache(maxsize=4096)(fast_length)  # what is compiled asks for none
 
 
 class Renderer(Bank):
@@ -44,7 +46,7 @@ class Renderer(Bank):
         """The renderer of what a layer reaches from its place, to which `around` brings what lies around; None where
         that takes about as long as the whole.
         """
-        if self.reached(place, batch=batch) == (batch, 1):
+        if self.reached(place, batch=batch) is None:
             return None
         (top, bottom), (left, right) = place.box(self.window, self.picture)
         return replace(self, picture=(bottom - top, right - left), border="given", cache=None)
@@ -56,20 +58,20 @@ class Renderer(Bank):
             planes = part(planes, start - m // 2, stop + (m - 1) // 2, border, dim=dim)
         return planes
 
-    def reached(self, place: Place, *, batch: int) -> tuple[int, float]:
-        """How many pictures of a batch a layer is rendered in, and in what share of each: where it is, or in all of
-        them where little would be saved.
+    def reached(self, place: Place, *, batch: int) -> tuple[int, float] | None:
+        """In how many pictures of a batch a layer is rendered, and in what share of each; None for all, where little
+        would be saved.
         """
         if self.border not in _CUT:
-            return batch, 1.0
+            return None
         sides = [stop - start for start, stop in place.box(self.window, self.picture)]
         if self.direct:
             share = math.prod(sides) / math.prod(self.picture)
         else:
-            points = math.prod(fast_length(n + m - 1) for n, m in zip(sides, self.window, strict=True))
+            points = math.prod(_length(n + m - 1) for n, m in zip(sides, self.window, strict=True))
             share = points / (math.prod(self.sizes.size) * math.prod(self.squares))
         items = len(place.items)
-        return (items, min(1.0, share)) if items * share < _SAVED * batch else (batch, 1.0)
+        return (items, min(1.0, share)) if items * share < _SAVED * batch else None
 
     @property
     def at_once(self) -> int:

@@ -67,6 +67,11 @@ class Bank:
             self.square, self.window, border=self.border, itemsize=itemsize, max_memory=memory, layers=layers
         )
 
+    @property
+    def seen(self) -> tuple[int, int]:
+        """Pixels of the result."""
+        return self.sizes.seen if self.squares == (1, 1) else self.picture
+
     @functools.cached_property
     def convolution(self) -> Convolution:
         """The transforms of a square: one of several comes with what lies around it."""
