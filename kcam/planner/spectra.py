@@ -49,9 +49,9 @@ WINDOW = {"psf_shape", "renormalise"}
 """Of those, those that line spreads tell roughly."""
 
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
-_HIDDEN_LIGHTS = 1.5  # the same of few lights, and of PSFs that are cut off
+_HIDDEN_LIGHTS = 1.5  # the same of few lights
 _SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture, and what is behind it is not
-_CUT = 1.4  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
+_CUT = 2.0  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
@@ -272,11 +272,11 @@ class Spectra:
 
     @functools.cached_property
     def _replaced(self) -> Tensor:
-        """Times the error without occlusion that there is with it, (B,)."""
+        """Times the error without occlusion that there is with it, (B,): more of a few lights or patches of light."""
         light, defocus = self._light, self.imaging.defocus(self.wavelengths)
         patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
         few = torch.minimum(_lights(light), _lights(patches)) < _FEW
-        found = torch.where(few | (not self.fits), _HIDDEN_LIGHTS, _HIDDEN).double()
+        found = torch.where(few, _HIDDEN_LIGHTS, _HIDDEN).double()
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
         far, near = (defocus.radius(end) - defocus.floor for end in ends)
