@@ -57,7 +57,7 @@ def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
             ratio = evaluator.error(ours, theirs) / max(trial, 1e-30)
             if 1e-3 < trial < 1:
                 of_flat = (0.6, 4.5) if not fits else (0.6, 2.5) if "points" in text else (0.7, 1.4)
-                low, high = of_flat if flat else (0.6, 8.0)
+                low, high = of_flat if flat else (0.6, 6.0 if fits else 12.0)
                 assert low < ratio < (high if seen else 1000), (
                     f"{text}: {ours} against {theirs}, {ratio:.3g} x {trial:.3g}"
                 )
