@@ -272,7 +272,9 @@ class Spectra:
 
     @functools.cached_property
     def _replaced(self) -> Tensor:
-        """Times the error without occlusion that there is with it, (B,): more of a few lights or patches of light."""
+        """Times the error without occlusion that there is with it, (B,): more of a few lights or patches of light, and
+        where something near is seen through.
+        """
         light, defocus = self._light, self.imaging.defocus(self.wavelengths)
         patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
         few = torch.minimum(_lights(light), _lights(patches)) < _FEW
@@ -395,14 +397,10 @@ class Spectra:
     @functools.cached_property
     def fits(self) -> bool:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
-        query = self._query(self.imaging, self._ends, self.wavelengths, self._window(self.imaging, self._ends))
-        return query is None or _inside(query)
-
-    @functools.cached_property
-    def _ends(self) -> Tensor:
-        """The vergences of what is farthest, and nearest, (2,)."""
         vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
-        return torch.stack([vergences.min(), vergences.max()])
+        ends = torch.stack([vergences.min(), vergences.max()])
+        query = self._query(self.imaging, ends, self.wavelengths, self._window(self.imaging, ends))
+        return query is None or _inside(query)
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
         if not isinstance(lens := imaging.lens, Lens):
