@@ -51,7 +51,9 @@ WINDOW = {"psf_shape", "renormalise"}
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
 _SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture, and what is behind it is not
-_CUT = 2.0  # times the error where a window as large as the picture cuts rays off: no slice knows its corners
+_EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
+_CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
+# and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
@@ -237,7 +239,7 @@ class Spectra:
             if self.hidden is None or not self._hides:
                 return off, all_of_it
             hiding, even = self._masks._linear(changes, against, roughly=roughly)
-            return off + self.hidden * hiding / even.clamp(min=1e-300) * all_of_it, all_of_it
+            return off + _EDGES * self.hidden * hiding / even.clamp(min=1e-300) * all_of_it, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
@@ -253,7 +255,7 @@ class Spectra:
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
         exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
-        factor = (1.0 if self.fits else _CUT) * (_BETWEEN if _differ(changes, against, {"interpolate_bands"}) else 1.0)
+        factor = self._corners * (_BETWEEN if _differ(changes, against, {"interpolate_bands"}) else 1.0)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
@@ -397,10 +399,22 @@ class Spectra:
     @functools.cached_property
     def fits(self) -> bool:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
+        return self._widest is None or _inside(self._widest)
+
+    @property
+    def _corners(self) -> float:
+        """Times the error along x and y that there is in the mean, at most."""
+        query = self._widest
+        if query is None or query.lens.has_pixels or self.fits:
+            return 1.0
+        return _CUT_ROUND if query.symmetric else _CUT
+
+    @functools.cached_property
+    def _widest(self) -> Query | None:
+        """The scene's ends in a whole window."""
         vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
         ends = torch.stack([vergences.min(), vergences.max()])
-        query = self._query(self.imaging, ends, self.wavelengths, self._window(self.imaging, ends))
-        return query is None or _inside(query)
+        return self._query(self.imaging, ends, self.wavelengths, self._window(self.imaging, ends))
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
         if not isinstance(lens := imaging.lens, Lens):
