@@ -19,7 +19,7 @@ def few_wavelengths(wavelengths: Tensor, count: int, *, interpolate: bool) -> tu
 
     Interpolated: the middles of equal steps in 1/wavelength, in which fringes are even, or the bands next to them, and
     cubics through the four nearest, which go on for half a step at the ends. Else neighbouring bands share the PSF of
-    their group's mean wavelength.
+    their group's mean wavelength; the larger groups lie at long wavelengths, where a step is less of a fringe.
     """
     nodes, shares = _few(tuple(wavelengths.tolist()), count, interpolate)
     return torch.tensor(nodes).to(wavelengths), torch.tensor(shares)
@@ -38,7 +38,7 @@ def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple
     shares = np.zeros((len(own), count))
     low, high = 1 / own.max(), 1 / own.min()
     if not interpolate or low == high:
-        for index, group in enumerate(np.array_split(own.argsort(kind="stable"), count)):
+        for index, group in enumerate(np.array_split((-own).argsort(kind="stable"), count)[::-1]):
             shares[group, index] = 1
         return own @ shares / shares.sum(0), shares
     step = (high - low) / count

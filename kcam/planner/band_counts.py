@@ -22,17 +22,18 @@ ROUND = 4
 """
 
 
-def even_counts(total: int) -> list[int]:
-    """Numbers of groups, ascending, each about twice the one before; those into which `total` divides evenly first.
+def group_counts(total: int) -> list[int]:
+    """Numbers of groups, ascending, each about four thirds of the one before; those into which `total` divides evenly
+    first.
 
-    Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are closer to all than 12
-    are, and 14 than 23.
+    Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are as close to all as 8
+    are, and 14 closer than 16.
     """
     found = [1]
     while found[-1] < total:
-        near = range(math.ceil(1.5 * found[-1]), math.floor(2.5 * found[-1]) + 1)
+        near = range(max(found[-1] + 1, math.ceil(1.2 * found[-1])), max(found[-1] + 1, round(1.6 * found[-1])) + 1)
         even = [count for count in near if total % count == 0]
-        found.append(even[-1] if even else 2 * found[-1])
+        found.append(even[-1] if even else max(found[-1] + 1, found[-1] * 4 // 3))
     return [count for count in found if count < total]
 
 

@@ -49,6 +49,7 @@ WITNESSED = 2**20  # pixels of the last trial
 NOTHING: Shortcuts = {}
 CUT = 1.01  # RMS of light over that of what the full well leaves of it, from which on that matters
 LOOKED = 129  # side of the PSFs with which the light is looked at, where these hold most of it: wide ones take long
+UNLIKE = 1.1  # of sharp light, in energy, up to which what pixels see of colours is as in blurred light
 HARDLY = 3e-3  # RMS of light that may be hidden, of what is recorded, that is taken for what it changes at most
 
 
@@ -106,6 +107,8 @@ class Evaluator:
         self._answers: dict[tuple[Any, ...], list[Answer]] = {}
         self.scenes = full
         self.signals: list[dict[int, tuple[Tensor, Context]]] = []
+        self.lost: dict[int, float] = {}  # see `_cut_off`
+        self.dimmed: float | None = None  # by blur, what was looked at without, at most: RMS over RMS
         self.spectra: list[Spectra] | None = None
 
     @functools.cached_property
@@ -140,12 +143,31 @@ class Evaluator:
                 )
                 for sample in self.samples
             ]
+            if self._sharply(few):
+                return
             narrow = [window for one in self.spectra if (window := one.narrow(few, LOOKED))]
             if narrow and len(narrow) == len(self.spectra):
                 few |= {"psf_shape": max(narrow), "renormalise": True}
         self.signals = self._signals(few)
+        self.lost = self._cut_off()
         if self.spectra and not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
             self.spectra = None
+
+    def _sharply(self, settings: Mapping[str, Any]) -> bool:
+        """See the same without blur, where that tells as much: of light that mirrors go on with, of which nothing is
+        cut off, and not more where pixels see little of its colour.
+        """
+        if self.imaging is None or self.imaging.border != "reflect":
+            return False
+        self.signals = self._signals(sharp := {"blur": False})
+        self.lost = self._cut_off()
+        if max(self.lost.values()) > 1 or not self._compare(sharp):
+            return False
+        told = self.spectra or []
+        if max(spectra.unlike for spectra in told) > UNLIKE:
+            return False
+        self.dimmed = max(spectra.dimmed(settings) for spectra in told)
+        return True
 
     def _compare(self, settings: Mapping[str, Any]) -> bool:
         """What spectra say of the light with what was seen of it, where nothing but colours lies between; whether they
@@ -173,8 +195,7 @@ class Evaluator:
         owners = (owner for sample in self.samples for owner in sample.owners)
         return zip(owners, self.signals, strict=True)
 
-    @functools.cached_property
-    def lost(self) -> dict[int, float]:
+    def _cut_off(self) -> dict[int, float]:
         """RMS of the light of each whole over that of what the full well leaves of it."""
         energies: dict[int, list[float]] = {}
         for owner, given in self._signals_by_owner:

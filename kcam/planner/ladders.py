@@ -17,7 +17,7 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
-from kcam.planner.band_counts import FEW_BANDS, GREY, GRIDS, ROUND, even_counts, interpolated, node_counts
+from kcam.planner.band_counts import FEW_BANDS, GREY, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.scene import Scene
 
@@ -29,6 +29,11 @@ ORDERS = (1.0, 1.5)
 
 QUADRATURE = (1.25, 2.0)
 """The same of groups of wavelengths: with these 51 estimates from below were 1.1 to 25 times the truth."""
+
+STEP = 1.5
+"""How much finer the rung is at least, by whose step from here an error is foretold: of smaller ones most would be
+foretold, not seen.
+"""
 
 FASTEST = 2.0
 """With which power of its step no ladder's error falls."""
@@ -61,7 +66,7 @@ ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 """By which two ways to the same picture differ."""
 
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
-LAYERS = (1, 2, 3, 5, 9, 17, 33, 65, 129)
+LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
 
@@ -202,9 +207,10 @@ class Ladder:
 
         Of order p, e = step r / (1 - r), r = (fineness below / fineness)^p; p from two steps, if there are two.
         """
-        if self.position == 0:
+        priced = {position for position, _ in self.errors}
+        below = sorted(low for low in priced if STEP * self.levels[low].fineness <= self.level.fineness)[-2:]
+        if not below:
             return self._by_the_next(evaluator)
-        below = sorted({position for position, _ in self.errors if position < self.position})[-2:]
         known = [self.beside | self.levels[position].changes for position in (*below, self.position)]
         steps = [evaluator.error(below, above) for below, above in pairwise(known)]
         last = self.level.fineness / self.levels[below[-1]].fineness
@@ -214,18 +220,24 @@ class Ladder:
         return steps[-1] / (last**order - 1)
 
     def _by_the_next(self, evaluator: Evaluator) -> float:
-        """What is left from here, by the step to the next rung and the order from there on."""
-        upper = self.levels[self.position + 1]
+        """What is left from here, by the step to the next rung that is finer enough, and the order from there on."""
+        upper = self.levels[self._above]
         step = evaluator.error(self.beside | self.level.changes, self.beside | upper.changes)
-        last = self.position + 2 == len(self.levels)
-        return step if last else step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
+        top = self._above + 1 == len(self.levels)
+        return step if top else step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
+
+    @property
+    def _above(self) -> int:
+        """The next rung by a `STEP`, or the top."""
+        finer = (index for index, level in enumerate(self.levels) if level.fineness >= STEP * self.level.fineness)
+        return next(finer, len(self.levels) - 1)
 
     def climb(self, evaluator: Evaluator, most: float) -> None:
         """One rung up, and its error, of which there may be so much at most; first, what that rung says of this one,
         which may then do. Rungs that cannot do, at the fastest that errors fall, are not looked at.
         """
-        key, two_up = self._key(self.position), self.position + 2
-        if self.successive and self.position > 0 and two_up < len(self.levels) and key not in self.compared:
+        key = self._key(self.position)
+        if self.successive and self.position > 0 and self._above + 1 < len(self.levels) and key not in self.compared:
             self.compared.add(key)
             self.errors[key] = self._by_the_next(evaluator)
             return
@@ -379,7 +391,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     beside = view.few(bands=0)
     successive = view.computed and not view.evaluator.tabled(beside)
     if successive or any(is_deep(scene) for scene in view.evaluator.scenes):
-        few: list[dict[str, Any]] = [{"bands": n} for n in even_counts(view.bands)]
+        few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]
     else:
         few = [interpolated(n) for n in node_counts(view.bands)]
     few_layers = view.layers <= FEW_LAYERS

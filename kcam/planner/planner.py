@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from kcam.camera import Camera
-from kcam.context import Context, Stage
+from kcam.context import Stage
 from kcam.effects import Skippable, Work
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
@@ -36,9 +36,6 @@ SENSOR = "sensor"
 
 NOISE_SHARE = 0.1
 """Of all noise, that a source may be and be left out where the sensor sets the tolerance: 0.5 % of the sum."""
-
-Signals = Sequence[Mapping[int, tuple[torch.Tensor, Context]]]
-"""For each sample, what the stages of the sensor are given."""
 
 GAIN = 0.98  # of the time, that a choice must leave to be considered
 
@@ -162,7 +159,7 @@ class Planner:
             rows.add_way()
             for skip in skips:
                 rows.add_skip(skip, left_out=skip.index in shortcuts and shortcuts[skip.index] is None)
-            rows.add_saturation(self.camera, self.evaluator.signals)
+            rows.add_saturation(self.camera, self.evaluator)
         rows.add_memory()
         errors = [row.error for row in rows.decisions if row.counted]
         reference = self.prices.of({})
@@ -222,7 +219,7 @@ class Planner:
             prices = self.prices
             every = ladders(self.evaluator, prices.scene, one=self.one)
             steps = [ladder for ladder in every if not ladder.doubtful or self.prices.saves(ladder)]
-            skips = [_Skip(self.camera, index, self.evaluator.signals) for index in self.evaluator.skippable()]
+            skips = [_Skip(self.camera, index, self.evaluator) for index in self.evaluator.skippable()]
             self._known = steps, skips
         return self._known
 
@@ -334,12 +331,12 @@ def _urgency(way: Ladder | _Skip) -> float:
 class _Skip:
     """A stage that may be left out, or take a cheaper form (`cheaper`): a ladder where its error counts."""
 
-    def __init__(self, camera: Camera, index: int, signals: Signals) -> None:
+    def __init__(self, camera: Camera, index: int, evaluator: Evaluator) -> None:
         self.stage: Any = camera[index]
         self.index, self.position = index, 0
         self.counted = not isinstance(self.stage, (RandomStage, ADC))
-        found = [given[index] for given in signals]
-        errors = [self.stage.error_if_skipped(*signal) for signal in found]
+        found = [given[index] for given in evaluator.signals]
+        errors = [(evaluator.dimmed or 1.0) * self.stage.error_if_skipped(*signal) for signal in found]
         worst = max(range(len(errors)), key=errors.__getitem__)
         self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst])
         forms = getattr(self.stage, "cheaper", None)
@@ -507,12 +504,14 @@ class _Rows:
         why = f"{skip.reason}; saves {saved * 1e3:.2g} ms" if left_out else skip.reason
         self._add(name, chosen, instead, why, error, skip.counted)
 
-    def add_saturation(self, camera: Camera, signals: Signals) -> None:
+    def add_saturation(self, camera: Camera, evaluator: Evaluator) -> None:
         """What the full well cuts off."""
         for index, stage in enumerate(camera):
             if isinstance(stage, ShotNoise):
-                peak = max((float(given[index][0].max()) for given in signals if given[index][0].numel()), default=0.0)
-                why = f"the brightest pixel fills {peak:.2g} of the well"
+                lights = (given[index][0] for given in evaluator.signals)
+                peak = max((float(light.max()) for light in lights if light.numel()), default=0.0)
+                fills = "fills" if evaluator.dimmed is None else "would fill, in focus,"
+                why = f"the brightest pixel {fills} {peak:.2g} of the well"
                 self._add("saturation", "kept", "", why)
             if isinstance(stage, ENDS):
                 return

@@ -31,7 +31,7 @@ from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.source import Points
-from kcam.planner.band_counts import FEW_BANDS, even_counts, interpolated, node_counts
+from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import cross_spectra, rings
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, ShotNoise, Transmission
@@ -137,6 +137,16 @@ class Spectra:
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
         return True
 
+    @property
+    def unlike(self) -> float:
+        """What spectra said of the light of a row over what was recorded of it, in energy, at most: see `compare`."""
+        return float(self._unlike.max())
+
+    def dimmed(self, settings: Mapping[str, Any]) -> float:
+        """How much less light there is with some settings than without blur, at most: RMS over RMS."""
+        sharp, seen = (self._whole(own, exactly=False) for own in ({**settings, "blur": False}, settings))
+        return float((sharp / seen.clamp(min=1e-300)).max()) ** 0.5
+
     def _whole(self, settings: Mapping[str, Any], *, exactly: bool) -> Tensor:
         """The energy of each row with some settings, (B,)."""
         found = torch.zeros(len(self.scene.coefficients), dtype=torch.float64)
@@ -216,7 +226,7 @@ class Spectra:
         """All wavelengths at which PSFs may stand for those of others."""
         own, deep = self.wavelengths, is_deep(self.scene)
         few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
-        few += [{"bands": n} for n in even_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
+        few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
         return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
 
     def energies(

@@ -22,7 +22,7 @@ from kcam import Camera, Scene, isp, optics, sensor
 from kcam.effects import Work
 from kcam.optics.propagation.row import Propagator
 from kcam.planner import OutOfRange, Plan, Planner, costs, evaluation, noiseless_raw, relative_rms
-from kcam.planner.ladders import even_counts
+from kcam.planner.ladders import group_counts
 from kcam.planner.plan import UNTRIED, with_imaging
 from kcam.units import mm, um, wavelength_grid
 
@@ -470,7 +470,7 @@ def test_memory_is_bounded_by_max_memory() -> None:
     ("total", "counts"), [(28, [1, 2, 4, 7, 14]), (1, []), (2, [1]), (31, [1, 2, 4, 8, 16]), (36, [1, 2, 4, 9, 18])]
 )
 def test_bands_are_grouped_evenly(total: int, counts: list[int]) -> None:
-    assert even_counts(total) == counts
+    assert group_counts(total) == counts
 
 
 # ---- the value -----------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from kcam import Camera, Scene, optics, sensor
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
 from kcam.planner import Planner
-from kcam.planner.band_counts import even_counts, node_counts
+from kcam.planner.band_counts import group_counts, node_counts
 from kcam.planner.evaluation import Evaluator, _error
 from kcam.planner.ladders import LITTLE, Ladder, Level
 from kcam.planner.spectra import Spectra, _compressed
@@ -104,7 +104,7 @@ def test_windows_hold_the_light_that_transfer_functions_begin_with(seed: int, sh
 @pytest.mark.parametrize("total", [28, 33, 9])
 def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int) -> None:
     """Rungs that converge with an order between one and two: by the steps below, then by the next rung."""
-    counts = [*even_counts(total), total]
+    counts = [*group_counts(total), total]
     levels = [Level(str(n), {"bands": n}, n) for n in counts]
 
     def left(n: float) -> float:
@@ -322,7 +322,7 @@ def test_glass_without_a_filter_dims_picture_and_error_alike(transmission: float
 @pytest.mark.parametrize("most", [0.5, 0.03, 1e-3])
 def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> None:
     """However fast errors fall, the rung that is reached does, and none that was passed over would have."""
-    counts = [*even_counts(128), 128]
+    counts = [*group_counts(128), 128]
     asked: set[int] = set()
 
     def step(ours: dict, theirs: dict) -> float:
