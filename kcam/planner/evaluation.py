@@ -143,7 +143,7 @@ class Evaluator:
                 )
                 for sample in self.samples
             ]
-            if self._sharply(few):
+            if self._sharply({name: value for name, value in settings.items() if name != "kappa"}):
                 return
             narrow = [window for one in self.spectra if (window := one.narrow(few, LOOKED))]
             if narrow and len(narrow) == len(self.spectra):
@@ -159,7 +159,7 @@ class Evaluator:
         """
         if self.imaging is None or self.imaging.border != "reflect":
             return False
-        self.signals = self._signals(sharp := {"blur": False})
+        self.signals = self._signals(sharp := {**settings, "blur": False})
         self.lost = self._cut_off()
         if max(self.lost.values()) > 1 or not self._compare(sharp):
             return False

@@ -108,6 +108,7 @@ class Spectra:
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
+        self._stages: dict[Any, Imaging] = {}  # by changes
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator, window and layers
         self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
@@ -189,7 +190,7 @@ class Spectra:
         """The middle of wide windows, so many pixels at most, where that holds most of the light with some settings, as
         far as it is known without PSFs.
         """
-        imaging, found = self.imaging.changed(**settings), (0, 0)
+        imaging, found = self._stage(settings), (0, 0)
         wavelengths = imaging.psf_wavelengths(self.wavelengths, deep=is_deep(self.scene))
         for index in range(len(self.groups)):
             vergences = self._of(index, settings.get("layers")).vergences
@@ -212,7 +213,7 @@ class Spectra:
         return all(table is None and self._lines(*asked) is not None for table, asked in self._at_once(settings))
 
     def _at_once(self, settings: Mapping[str, Any]) -> Iterator[tuple[_Table | None, tuple[Imaging, Tensor, Tensor]]]:
-        imaging = self.imaging.changed(**settings)
+        imaging = self._stage(settings)
         for index in range(len(self.groups)):
             asked = imaging, self._of(index, settings.get("layers")).vergences, self._few
             yield self._table(*asked), asked
@@ -333,9 +334,16 @@ class Spectra:
         if key not in self._known:
             between = None
             if changes.get("layers") != against.get("layers"):
-                between = self._between(self.groups[index][1], layered.vergences, self.imaging.changed(**changes))
+                between = self._between(self.groups[index][1], layered.vergences, self._stage(changes))
             self._known[key] = self._mixed(layered, changes, between, exactly=exactly)
         return self._known[key]
+
+    def _stage(self, changes: Mapping[str, Any]) -> Imaging:
+        """With changes: kept, because each setting is asked about often."""
+        key = tuple(sorted(changes.items()))
+        if key not in self._stages:
+            self._stages[key] = self.imaging.changed(**changes)
+        return self._stages[key]
 
     def _between(self, scene: Scene, vergences: Tensor, imaging: Imaging) -> tuple[Tensor, Tensor]:
         """Vergences (Y,) of the layers of a stage, and what each of others, (Z,), takes from these, (Z, Y)."""
@@ -358,7 +366,7 @@ class Spectra:
 
         between: what `_between` says of the layers of these changes, if they are others.
         """
-        imaging, scene = self.imaging.changed(**changes), self.scene
+        imaging, scene = self._stage(changes), self.scene
         deep = is_deep(scene)
         groups = imaging.psf_wavelengths(scene.wavelengths, deep=deep)
         vergences = layered.vergences if between is None else between[0]
@@ -411,7 +419,7 @@ class Spectra:
         """Whether the window of a whole PSF cuts nothing but diffraction off."""
         return self._widest is None or _inside(self._widest)
 
-    @property
+    @functools.cached_property
     def _corners(self) -> float:
         """Times the error along x and y that there is in the mean, at most."""
         query = self._widest
