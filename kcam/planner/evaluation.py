@@ -155,15 +155,16 @@ class Evaluator:
 
     def _sharply(self, settings: Mapping[str, Any]) -> bool:
         """See the same without blur, where that tells as much: of light that mirrors go on with, of which nothing is
-        cut off, and not more where pixels see little of its colour.
+        cut off, as of a few that stand out, and not more where pixels see little of its colour.
         """
-        if self.imaging is None or self.imaging.border != "reflect":
+        told = self.spectra or []
+        mirrored = self.imaging is not None and self.imaging.border == "reflect"
+        if not mirrored or any(bool(spectra.few_lights.any()) for spectra in told):
             return False
         self.signals = self._signals(sharp := {**settings, "blur": False})
         self.lost = self._cut_off()
         if max(self.lost.values()) > 1 or not self._compare(sharp):
             return False
-        told = self.spectra or []
         if max(spectra.unlike for spectra in told) > UNLIKE:
             return False
         self.dimmed = max(spectra.dimmed(settings) for spectra in told)

@@ -284,14 +284,18 @@ class Spectra:
         return 1 + 1 / _lights(self._light)
 
     @functools.cached_property
+    def few_lights(self) -> Tensor:
+        """Whether a few pixels, or patches, have most of the energy of a row, (B,)."""
+        patches = functional.avg_pool2d(self._light, min(_PATCH, *self._light.shape[-2:]), ceil_mode=True)
+        return torch.minimum(_lights(self._light), _lights(patches)) < _FEW
+
+    @functools.cached_property
     def _replaced(self) -> Tensor:
         """Times the error without occlusion that there is with it, (B,): more of a few lights or patches of light, and
         where something near is seen through.
         """
-        light, defocus = self._light, self.imaging.defocus(self.wavelengths)
-        patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
-        few = torch.minimum(_lights(light), _lights(patches)) < _FEW
-        found = torch.where(few, _HIDDEN_LIGHTS, _HIDDEN).double()
+        defocus = self.imaging.defocus(self.wavelengths)
+        found = torch.where(self.few_lights, _HIDDEN_LIGHTS, _HIDDEN).double()
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
         far, near = (defocus.radius(end) - defocus.floor for end in ends)
