@@ -42,6 +42,9 @@ LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kap
 LINEAR |= {"layers", "occlusion"}
 """Changes of an Imaging that act as transfer functions do, and that of what hides what."""
 
+COLOURS = {"bands", "interpolate_bands"}
+"""Of these, those of the wavelengths."""
+
 WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 """Of these, those whose error is that of the PSFs themselves, not of what they are computed for."""
 
@@ -52,6 +55,8 @@ _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hi
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
 _SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture, and what is behind it is not
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
+_DROWNED = 1.3  # light that may be hidden, of what is recorded, from which on masks say more, up to all of it
+_COLOURED = 2.0  # times what is hidden beyond that, the energy that a choice of wavelengths errs more: masks are white
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
@@ -249,8 +254,12 @@ class Spectra:
             off, all_of_it = self._linear(changes, against, roughly=roughly)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
+            drowned = (self.hidden - _DROWNED).clamp(min=0)
+            if not _differ(changes, against, LINEAR - COLOURS):
+                return off * (1 + _COLOURED * drowned), all_of_it
             hiding, even = self._masks._linear(changes, against, roughly=roughly)
-            return off + _EDGES * self.hidden * hiding / even.clamp(min=1e-300) * all_of_it, all_of_it
+            said = (_EDGES + drowned).clamp(max=1) * self.hidden * hiding / even.clamp(min=1e-300)
+            return off + said * all_of_it, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:

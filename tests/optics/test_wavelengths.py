@@ -59,6 +59,7 @@ def test_groups_share_the_psf_of_their_mean(seed: int) -> None:
         assert bool(((shares == 0) | (shares == 1)).all())
         assert bool((shares.sum(1) == 1).all())
         assert int(shares.sum(0).max()) - int(shares.sum(0).min()) <= 1
+        assert shares.sum(0).tolist() == sorted(shares.sum(0).tolist())  # the larger ones at long wavelengths
         for index, node in enumerate(nodes):
             torch.testing.assert_close(node, own[shares[:, index] == 1].mean())
 

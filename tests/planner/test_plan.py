@@ -467,7 +467,14 @@ def test_memory_is_bounded_by_max_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    ("total", "counts"), [(28, [1, 2, 4, 7, 14]), (1, []), (2, [1]), (31, [1, 2, 4, 8, 16]), (36, [1, 2, 4, 9, 18])]
+    ("total", "counts"),
+    [
+        (28, [1, 2, 3, 4, 5, 7, 9, 14, 18]),
+        (1, []),
+        (2, [1]),
+        (31, [1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22]),
+        (36, [1, 2, 3, 4, 6, 9, 12, 18, 24]),
+    ],
 )
 def test_bands_are_grouped_evenly(total: int, counts: list[int]) -> None:
     assert group_counts(total) == counts
