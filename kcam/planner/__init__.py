@@ -5,12 +5,12 @@ from kcam.planner.plan import (
     OutOfRange,
     Plan,
     PlannedCamera,
-    Range,
     noiseless_raw,
     relative_rms,
     with_imaging,
 )
 from kcam.planner.planner import Planner, explain, make_plan, measured, shoot, timed
+from kcam.planner.range import Range
 
 __all__ = [
     "Decision",

@@ -25,18 +25,8 @@ from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import Imaging
 from kcam.optics.source import Defocus
-from kcam.planner.plan import (
-    COLOUR,
-    DEPTH,
-    ENDS,
-    OTHER_LIGHT,
-    Shortcuts,
-    noiseless_raw,
-    relative_rms,
-    shares,
-    shortened,
-    with_imaging,
-)
+from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
+from kcam.planner.range import COLOUR, DEPTH, OTHER_LIGHT, shares
 from kcam.planner.spectra import LINEAR, Spectra, linear
 from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene

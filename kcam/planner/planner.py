@@ -20,7 +20,8 @@ from kcam.optics.rendering.place import Place
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
-from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, Range, noiseless_raw, shortened, together
+from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_raw, shortened, together
+from kcam.planner.range import Range
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, ShotNoise
 from kcam.sensor.random_stage import RandomStage
