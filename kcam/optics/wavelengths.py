@@ -40,7 +40,9 @@ def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple
     if not interpolate or low == high:
         for index, group in enumerate(np.array_split((-own).argsort(kind="stable"), count)[::-1]):
             shares[group, index] = 1
-        return own @ shares / shares.sum(0), shares
+        means = own @ shares / shares.sum(0)
+        near = own[np.abs(own - means[:, None]).argmin(1)]
+        return np.where(np.isclose(near, means, rtol=1e-9, atol=0), near, means), shares  # a band is itself
     step = (high - low) / count
     place = (1 / own - low) / step - 0.5
     nodes, nearest = np.arange(count, dtype=float), np.abs(place - np.arange(count)[:, None]).argmin(1)

@@ -23,7 +23,7 @@ from torch import Tensor
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
-from kcam.optics import Imaging
+from kcam.optics import Imaging, Lens
 from kcam.optics.source import Defocus
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
 from kcam.planner.range import COLOUR, DEPTH, OTHER_LIGHT, shares
@@ -98,7 +98,7 @@ class Evaluator:
         self.scenes = full
         self.signals: list[dict[int, tuple[Tensor, Context]]] = []
         self.lost: dict[int, float] = {}  # see `_cut_off`
-        self.dimmed: float | None = None  # by blur, what was looked at without, at most: RMS over RMS
+        self.dimmed: list[float] = []  # of each signal, by blur, where it was looked at without: RMS over RMS
         self.spectra: list[Spectra] | None = None
 
     @functools.cached_property
@@ -120,8 +120,8 @@ class Evaluator:
         return _samples(self.scenes, self.surveys, pixels=2**62 if self.whole else WITNESSED)
 
     def look(self, settings: Mapping[str, Any]) -> None:
-        """See what the stages of the sensor are given, with about these optics, and whether spectra tell what choices
-        cost: where the raw is linear in the light, but for what the full well cuts off.
+        """See what the stages of the sensor are given, with about these optics or without blur, and whether spectra
+        tell what choices cost: where the raw is linear in the light, but for what the full well cuts off.
         """
         few = {**settings, "bands": 1, "occlusion": False}  # it moves little of the light, and takes half of the time
         if "layers" in few and not any(bool(one.potential[BEYOND].any()) for one in self.items):
@@ -133,7 +133,8 @@ class Evaluator:
                 )
                 for sample in self.samples
             ]
-            if self._sharply({name: value for name, value in settings.items() if name != "kappa"}):
+            # no grid of the pupil is coarse in spectra, and what these settings ask for others will ask for too
+            if self._sharply(self.imaging, self.spectra, {k: v for k, v in settings.items() if k != "kappa"}):
                 return
             narrow = [window for one in self.spectra if (window := one.narrow(few, LOOKED))]
             if narrow and len(narrow) == len(self.spectra):
@@ -143,21 +144,21 @@ class Evaluator:
         if self.spectra and not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
             self.spectra = None
 
-    def _sharply(self, settings: Mapping[str, Any]) -> bool:
+    def _sharply(self, imaging: Imaging, told: Sequence[Spectra], settings: Mapping[str, Any]) -> bool:
         """See the same without blur, where that tells as much: of light that mirrors go on with, of which nothing is
-        cut off, as of a few that stand out, and not more where pixels see little of its colour.
+        cut off, as of a few lights that stand out, and not more where pixels see little of its colour.
         """
-        told = self.spectra or []
-        mirrored = self.imaging is not None and self.imaging.border == "reflect"
-        if not mirrored or any(bool(spectra.few_lights.any()) for spectra in told):
+        known = imaging.border == "reflect" and isinstance(imaging.lens, Lens)  # whose PSFs brighten nothing
+        if not known or any(bool(spectra.few_lights.any()) for spectra in told):
             return False
         self.signals = self._signals(sharp := {**settings, "blur": False})
         self.lost = self._cut_off()
-        if max(self.lost.values()) > 1 or not self._compare(sharp):
+        if max(self.lost.values()) > 1:
             return False
+        self._compare(sharp)
         if max(spectra.unlike for spectra in told) > UNLIKE:
             return False
-        self.dimmed = max(spectra.dimmed(settings) for spectra in told)
+        self.dimmed = [row for spectra in told for row in spectra.dimmed(settings)]
         return True
 
     def _compare(self, settings: Mapping[str, Any]) -> bool:
@@ -357,6 +358,11 @@ class Evaluator:
                 ]
         return result
 
+    @property
+    def dimmings(self) -> list[float]:
+        """Of each signal, how many times as large errors are, relative to blurred light."""
+        return self.dimmed or [1.0] * len(self.signals)
+
     def noise(self) -> float:
         """Sigma of all noise and half a step of the ADC, relative to the raw's RMS: of the scene that has least."""
         found: dict[int, list[float]] = {}
@@ -364,11 +370,11 @@ class Evaluator:
             share = 3 if isinstance(stage, ADC) else 1  # half a step is sqrt(3) of its sigma
             if isinstance(stage, (RandomStage, ADC)):
                 energies: dict[int, list[float]] = {}
-                for owner, given in self._signals_by_owner:
+                for (owner, given), dimmed in zip(self._signals_by_owner, self.dimmings, strict=True):
                     energy = float(given[index][0].detach().double().square().sum())
                     part = energies.setdefault(owner, [0.0, 0.0])
                     part[0] += share * energy * stage.error_if_skipped(*given[index]) ** 2
-                    part[1] += energy
+                    part[1] += energy / dimmed**2
                 for owner, (noise, energy) in energies.items():
                     found.setdefault(owner, []).append(noise / max(energy, 1e-30))
             if isinstance(stage, ENDS):

@@ -205,26 +205,34 @@ class Ladder:
     def _beyond(self, evaluator: Evaluator) -> float:
         """What is left from here to where rungs converge, by the steps up to here: that of the foot by the next one.
 
-        Of order p, e = step r / (1 - r), r = (fineness below / fineness)^p; p from two steps, if there are two.
+        Of order p, e = step r / (1 - r), r = (fineness below / fineness)^p; p from two steps, if there are two: that
+        of their middles.
         """
         priced = {position for position, _ in self.errors}
         below = sorted(low for low in priced if STEP * self.levels[low].fineness <= self.level.fineness)[-2:]
         if not below:
             return self._by_the_next(evaluator)
-        known = [self.beside | self.levels[position].changes for position in (*below, self.position)]
+        places = (*below, self.position)
+        known = [self.beside | self.levels[position].changes for position in places]
         steps = [evaluator.error(below, above) for below, above in pairwise(known)]
-        last = self.level.fineness / self.levels[below[-1]].fineness
+        finer = [math.log(above / below) for below, above in pairwise(self.levels[at].fineness for at in places)]
         order, most = self.orders
         if len(steps) > 1 and 0 < steps[1] < steps[0]:
-            order = min(max(math.log(steps[0] / steps[1]) / math.log(last), order), most)
-        return steps[-1] / (last**order - 1)
+            fall = math.log(steps[0] / steps[1] * finer[1] / finer[0])
+            order = min(max(2 * fall / sum(finer), order), most)
+        return self._up_to_top * steps[-1] / math.expm1(order * finer[-1])
+
+    @property
+    def _up_to_top(self) -> float:
+        """Of what is left from here to where rungs converge, what is left to the top, at most."""
+        return float(1 - (self.level.fineness / self.levels[-1].fineness) ** self.orders[1])
 
     def _by_the_next(self, evaluator: Evaluator) -> float:
         """What is left from here, by the step to the next rung that is finer enough, and the order from there on."""
         upper = self.levels[self._above]
         step = evaluator.error(self.beside | self.level.changes, self.beside | upper.changes)
         top = self._above + 1 == len(self.levels)
-        return step if top else step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
+        return step if top else self._up_to_top * step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
 
     @property
     def _above(self) -> int:
@@ -233,7 +241,7 @@ class Ladder:
         return next(finer, len(self.levels) - 1)
 
     def climb(self, evaluator: Evaluator, most: float) -> None:
-        """One rung up, and its error, of which there may be so much at most; first, what that rung says of this one,
+        """One rung up, and its error, of which there may be so much at most; first, what a finer one says of this one,
         which may then do. Rungs that cannot do, at the fastest that errors fall, are not looked at.
         """
         key = self._key(self.position)

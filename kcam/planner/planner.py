@@ -337,9 +337,11 @@ class _Skip:
         self.index, self.position = index, 0
         self.counted = not isinstance(self.stage, (RandomStage, ADC))
         found = [given[index] for given in evaluator.signals]
-        errors = [(evaluator.dimmed or 1.0) * self.stage.error_if_skipped(*signal) for signal in found]
+        dimmed = zip(evaluator.dimmings, found, strict=True)
+        errors = [times * self.stage.error_if_skipped(*signal) for times, signal in dimmed]
         worst = max(range(len(errors)), key=errors.__getitem__)
-        self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst])
+        seen = ", without blur" if evaluator.dimmed else ""
+        self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst]) + seen
         forms = getattr(self.stage, "cheaper", None)
         self.forms = [("left out", None, self.error_if_skipped), *(forms(*found[worst]) if callable(forms) else ())]
 
@@ -511,7 +513,7 @@ class _Rows:
             if isinstance(stage, ShotNoise):
                 lights = (given[index][0] for given in evaluator.signals)
                 peak = max((float(light.max()) for light in lights if light.numel()), default=0.0)
-                fills = "fills" if evaluator.dimmed is None else "would fill, in focus,"
+                fills = "would fill, without blur," if evaluator.dimmed else "fills"
                 why = f"the brightest pixel {fills} {peak:.2g} of the well"
                 self._add("saturation", "kept", "", why)
             if isinstance(stage, ENDS):

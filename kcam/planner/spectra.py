@@ -6,7 +6,8 @@ C are the cross-spectra of a scene's planes, in rings of frequency: mirrored at 
 dark there. H and G are transfer functions, of which slices through the middle suffice: light that runs more along x
 sees that along x. A^T A is what pixels record of each pair of bands, in their mean. With layers of depth each plane is
 split among them, and each layer has transfer functions of its own; where there are fewer, those of its neighbours. What
-layers hide of each other is off by as much as their masks are in even light, times the light that may be hidden.
+layers hide of each other is off as their masks are in even light: by a part of the light that may be hidden, and by all
+of it where that is much.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hi
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
 _SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture, and what is behind it is not
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
-_DROWNED = 1.3  # light that may be hidden, of what is recorded, from which on masks say more, up to all of it
-_COLOURED = 2.0  # times what is hidden beyond that, the energy that a choice of wavelengths errs more: masks are white
+_DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
+_COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
@@ -148,10 +149,11 @@ class Spectra:
         """What spectra said of the light of a row over what was recorded of it, in energy, at most: see `compare`."""
         return float(self._unlike.max())
 
-    def dimmed(self, settings: Mapping[str, Any]) -> float:
-        """How much less light there is with some settings than without blur, at most: RMS over RMS."""
+    def dimmed(self, settings: Mapping[str, Any]) -> list[float]:
+        """How much less light there is of each row with some settings than without blur: RMS over RMS."""
         sharp, seen = (self._whole(own, exactly=False) for own in ({**settings, "blur": False}, settings))
-        return float((sharp / seen.clamp(min=1e-300)).max()) ** 0.5
+        found: list[float] = (sharp / seen.clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
+        return found
 
     def _whole(self, settings: Mapping[str, Any], *, exactly: bool) -> Tensor:
         """The energy of each row with some settings, (B,)."""
@@ -254,7 +256,7 @@ class Spectra:
             off, all_of_it = self._linear(changes, against, roughly=roughly)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
-            drowned = (self.hidden - _DROWNED).clamp(min=0)
+            drowned = (self.hidden - _DROWNED).clamp(0, 1)
             if not _differ(changes, against, LINEAR - COLOURS):
                 return off * (1 + _COLOURED * drowned), all_of_it
             hiding, even = self._masks._linear(changes, against, roughly=roughly)
@@ -296,7 +298,8 @@ class Spectra:
     def few_lights(self) -> Tensor:
         """Whether a few pixels, or patches, have most of the energy of a row, (B,)."""
         patches = functional.avg_pool2d(self._light, min(_PATCH, *self._light.shape[-2:]), ceil_mode=True)
-        return torch.minimum(_lights(self._light), _lights(patches)) < _FEW
+        few = torch.minimum(_lights(self._light), _lights(patches)) < _FEW
+        return few & (self._light.flatten(1).amax(1) > 0).cpu()
 
     @functools.cached_property
     def _replaced(self) -> Tensor:
@@ -436,7 +439,7 @@ class Spectra:
     def _corners(self) -> float:
         """Times the error along x and y that there is in the mean, at most."""
         query = self._widest
-        if query is None or query.lens.has_pixels or self.fits:
+        if query is None or query.has_pixel_phase or self.fits:
             return 1.0
         return _CUT_ROUND if query.symmetric else _CUT
 
