@@ -23,8 +23,8 @@ ROUND = 4
 
 
 def group_counts(total: int) -> list[int]:
-    """Numbers of groups, ascending, each about four thirds of the one before; those into which `total` divides evenly
-    first.
+    """Numbers of groups, ascending, each about four thirds of the one before, up to half of all; those into which
+    `total` divides evenly first.
 
     Groups of one size are a better quadrature than more groups of two sizes: of 28 bands, 7 are as close to all as 8
     are, and 14 closer than 16.
@@ -34,7 +34,7 @@ def group_counts(total: int) -> list[int]:
         near = range(max(found[-1] + 1, math.ceil(1.2 * found[-1])), max(found[-1] + 1, round(1.6 * found[-1])) + 1)
         even = [count for count in near if total % count == 0]
         found.append(even[-1] if even else max(found[-1] + 1, found[-1] * 4 // 3))
-    return [count for count in found if count < total]
+    return [count for count in found if 2 * count <= total + total % 2 and count < total]
 
 
 def node_counts(total: int) -> list[int]:

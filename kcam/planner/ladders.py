@@ -67,6 +67,7 @@ ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
 LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
+MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
 
@@ -220,19 +221,14 @@ class Ladder:
         if len(steps) > 1 and 0 < steps[1] < steps[0]:
             fall = math.log(steps[0] / steps[1] * finer[1] / finer[0])
             order = min(max(2 * fall / sum(finer), order), most)
-        return self._up_to_top * steps[-1] / math.expm1(order * finer[-1])
-
-    @property
-    def _up_to_top(self) -> float:
-        """Of what is left from here to where rungs converge, what is left to the top, at most."""
-        return float(1 - (self.level.fineness / self.levels[-1].fineness) ** self.orders[1])
+        return steps[-1] / math.expm1(order * finer[-1])
 
     def _by_the_next(self, evaluator: Evaluator) -> float:
         """What is left from here, by the step to the next rung that is finer enough, and the order from there on."""
         upper = self.levels[self._above]
         step = evaluator.error(self.beside | self.level.changes, self.beside | upper.changes)
         top = self._above + 1 == len(self.levels)
-        return step if top else self._up_to_top * step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
+        return step if top else step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
 
     @property
     def _above(self) -> int:
@@ -429,7 +425,8 @@ def _depth(view: _View) -> Iterator[Ladder]:
     if view.layers == 1:
         return
     names = {1: "one plane"}
-    levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in LAYERS if n < view.layers]
+    few = [n for n in LAYERS if n <= MOST * view.layers]
+    levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in few]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=False)
     layers = Ladder("depth", [*levels, top], beside, successive=True)
