@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcam.optics.accuracy import OVER_THE_FIELD
 from kcam.optics.source import Defocus
+from kcam.optics.wavelengths import few_wavelengths
 from kcam.planner.survey import KINDS, NEIGHBOURS, OF_DEPTH, Survey
 from kcam.scene import Scene
 
@@ -107,8 +108,9 @@ class Range:
         band = int(ratios.argmax())
         yield f"share of light at {self.wavelengths[band] * 1e9:.0f} nm", float(ratios[band]) ** 2 / OTHER_LIGHT
         if "bands" in changes and bool(light.any()):
-            order = torch.tensor(self.wavelengths).argsort()
-            uneven = [_unevenness(one[order], int(changes["bands"])) + COLOUR for one in (light, known)]
+            groups = min(int(changes["bands"]), len(light))
+            _, members = few_wavelengths(torch.tensor(self.wavelengths), groups, interpolate=False)
+            uneven = [_unevenness(one, members.to(one)) + COLOUR for one in (light, known)]
             yield "differences of light between neighbouring wavelengths", (uneven[0] / uneven[1]) ** 2
 
     def leaves(self, scene: Scene) -> str | None:
@@ -139,9 +141,9 @@ def _rings(found: Survey) -> Tensor:
     return shares(torch.bincount(ring.flatten(), energy.double().flatten(), minlength=4).sqrt())
 
 
-def _unevenness(light: Tensor, groups: int) -> float:
-    """RMS of the differences between bands and the mean of their group, relative to that of all."""
-    apart = torch.cat([group - group.mean() for group in light.tensor_split(groups)])
+def _unevenness(light: Tensor, members: Tensor) -> float:
+    """RMS of the differences between bands and the mean of their group (L, G), relative to that of all."""
+    apart = light - members @ (light @ members / members.sum(0))
     return float(apart.norm() / light.norm().clamp(min=1e-30))
 
 
