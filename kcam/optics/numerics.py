@@ -13,6 +13,8 @@ import scipy
 import torch
 from torch import Tensor
 
+_CUBIC = 4  # nodes
+
 Pair = tuple[Tensor, Tensor]  # real and imaginary part: complex tensors cost twice here, in layout and in polar()
 
 
@@ -118,6 +120,16 @@ def linear_weights(nodes: Tensor, at: Tensor) -> Tensor:
     weights = torch.zeros(len(at), len(nodes), dtype=at.dtype, device=at.device)
     rows = torch.arange(len(at), device=at.device)
     return weights.index_put((rows, order[low]), 1 - share).index_put((rows, order[low + 1]), share)
+
+
+def cubic_weights(nodes: Tensor, at: Tensor) -> Tensor:
+    """Weights (N, n) of cubics through the four nearest of ascending nodes, which go on beyond the outermost; of the
+    polynomial through all of fewer.
+    """
+    order = min(len(nodes), _CUBIC)
+    first = (torch.searchsorted(nodes, at) - order // 2).clamp(0, len(nodes) - order)
+    taps = first[:, None] + torch.arange(order, device=at.device)
+    return at.new_zeros(len(at), len(nodes)).scatter(1, taps, lagrange_products(nodes[taps], at))
 
 
 def chebyshev(v: Tensor, degree: int) -> Tensor:

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import chebyshev_between, lagrange_products, lagrange_weights
+from kcam.optics.numerics import chebyshev_between, cubic_weights, lagrange_weights
 
-_CUBIC = 4  # nodes
 _NEAR = 0.25  # of a step, all that bands may lie beside its middle to be taken for it: of more cubics err more
 
 
@@ -48,9 +47,5 @@ def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple
     nodes, nearest = np.arange(count, dtype=float), np.abs(place - np.arange(count)[:, None]).argmin(1)
     bands = bool((np.abs(place[nearest] - nodes) <= _NEAR).all())
     nodes = place[nearest] if bands else nodes
-    order = min(count, _CUBIC)
-    first = np.clip(nodes.searchsorted(place) - order // 2, 0, count - order)
-    taps = first[:, None] + np.arange(order)
-    weights = lagrange_products(torch.tensor(nodes[taps]), torch.tensor(place))
-    np.put_along_axis(shares, taps, weights.numpy(), axis=1)
+    shares = cubic_weights(torch.tensor(nodes), torch.tensor(place)).numpy()
     return own[nearest] if bands else 1 / (low + step * (nodes + 0.5)), shares

@@ -216,10 +216,12 @@ class Evaluator:
         """Whether line spreads tell roughly what a window costs."""
         return self.spectra is not None and all(spectra.by_lines(settings) for spectra in self.spectra)
 
-    def error(self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False) -> float:
+    def error(
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
+    ) -> float:
         """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes.
 
-        By spectra light beyond the full well counts too, so that they say at least as much. roughly: see
+        By spectra light beyond the full well counts too, so that they say at least as much. roughly, cut: see
         `Spectra.energies`.
         """
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
@@ -228,7 +230,7 @@ class Evaluator:
             return self._hidden(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
-            found += self._relative(sample, torch.stack(spectra.energies(changes, against, roughly=roughly)))
+            found += self._relative(sample, torch.stack(spectra.energies(changes, against, roughly=roughly, cut=cut)))
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:

@@ -197,15 +197,23 @@ class Planner:
         does; gives the error that it found.
         """
         counted = [skip for skip in skips if skip.counted]
+        if self.evaluator.certain:
+            doubtful = [ladder for ladder in steps if ladder.doubtful and self.one]
+            for ladder in doubtful:
+                ladder.position = len(ladder.levels) - 1
+            _climb(steps, counted, self.evaluator, allowed / UNTRIED)
+            for ladder in doubtful:
+                if self.prices.worth(ladder, _changes(steps)):
+                    ladder.position = 0
+                    _climb(steps, counted, self.evaluator, allowed / UNTRIED)
+            return None
         while True:
-            _climb(steps, counted, self.evaluator, allowed / (UNTRIED if self.evaluator.certain else SAFETY))
-            if self.evaluator.certain:
-                return None
+            _climb(steps, counted, self.evaluator, allowed / SAFETY)
             ways: list[Any] = [*_relevant(steps), *counted]
             below = [way for way in ways if not way.at_top]
             if not below:
                 return 0.0
-            changes = {key: value for ladder in _relevant(steps) for key, value in ladder.level.changes.items()}
+            changes = _changes(steps)
             shortcuts = _shortcuts(skips, allowed, noise)
             key = tuple(sorted(changes.items())), repr(sorted(shortcuts.items()))
             if key not in self._checked:
@@ -306,6 +314,11 @@ def _relevant(steps: Sequence[Ladder]) -> list[Ladder]:
     """Ladders that matter: without blur, none of those that say how to compute it."""
     sharp = any(ladder.level.changes.get("blur") is False for ladder in steps)
     return [ladder for ladder in steps if not (sharp and ladder.blurs)]
+
+
+def _changes(steps: Sequence[Ladder]) -> dict[str, Any]:
+    """What they change, as they stand."""
+    return {key: value for ladder in _relevant(steps) for key, value in ladder.level.changes.items()}
 
 
 def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator, most: float) -> None:
@@ -456,6 +469,12 @@ class _Prices:
     def saves(self, ladder: Ladder) -> bool:
         """Whether its cheapest rung takes less time than its top."""
         return self.of(ladder.levels[0].changes)[0] <= GAIN * self.of({})[0] or len(ladder.levels) == 1
+
+    def worth(self, ladder: Ladder, changes: Mapping[str, Any]) -> bool:
+        """Whether its cheapest rung saves more beside such changes than pricing it takes."""
+        foot, beside = ladder.levels[0].changes, ladder.beside
+        saved = self.of({**changes})[0] - self.of({**changes, **foot})[0]
+        return saved > self.of(beside)[0] + self.of({**beside, **foot})[0]
 
 
 class _Rows:

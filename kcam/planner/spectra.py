@@ -17,7 +17,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,11 +27,13 @@ from kcam.camera import Camera
 from kcam.isp import Clip
 from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
+from kcam.optics.numerics import cubic_weights
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.source import Points
+from kcam.optics.wavelengths import few_wavelengths
 from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import cross_spectra, rings
 from kcam.scene import Scene
@@ -60,11 +62,16 @@ _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
-_BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF
+_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.45  # times the error of PSFs between others: what cubics leave is smaller than what
+# slices tell of a PSF, and of a map of pixels, of which only some rows are looked at
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
+_BETWEEN_LINES, _GROUPS, _FEW_GROUPS = 12, 9, 3  # wavelengths between whose line spreads those of all bands lie, for
+# errors of up to so many groups of these, and of these groups too, for so many: such errors are 0.85 to 1.2 times those
+# of each wavelength's own (5 to 95 % of 36 deep scenes behind maps)
+_BETWEEN_LAYERS = 4  # times as many layers as there are in a setting, between whose transfer functions its own lie
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
@@ -80,12 +87,29 @@ class _Layered:
     crossed: Tensor
 
 
+class _Way(NamedTuple):
+    """How transfer functions are found. exactly: by PSFs or tables; else by line spreads, where there are any. few: of
+    wavelengths between some. cut: in a smaller window, by those of the whole.
+    """
+
+    exactly: bool = False
+    few: bool = False
+    cut: bool = False
+
+
 @dataclass(frozen=True)
 class _Table:
-    """Wavelengths, and their transfer functions."""
+    """Wavelengths, and their transfer functions; middle: of three distances, of which the one in the middle counts."""
 
     wavelengths: list[float]
     transfer: Transfer
+    middle: bool = False
+
+    def __call__(self, frequencies: Tensor, window: tuple[int, int], wavelengths: Tensor) -> Tensor:
+        """At frequencies (F,) and some of the wavelengths (L,), (Z, L, 2, F)."""
+        places = [self.wavelengths.index(one) for one in wavelengths.tolist()]
+        found = self.transfer(frequencies, window, places)
+        return found[1:2] if self.middle else found
 
 
 class Spectra:
@@ -115,7 +139,7 @@ class Spectra:
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
         self._stages: dict[Any, Imaging] = {}  # by changes
-        self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator, window and layers
+        self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
         self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
@@ -160,7 +184,7 @@ class Spectra:
         found = torch.zeros(len(self.scene.coefficients), dtype=torch.float64)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, settings.get("layers"))
-            found[rows] = self._energy(self._once(index, layered, settings, settings, exactly=exactly), layered)
+            found[rows] = self._energy(self._once(index, layered, settings, settings, _Way(exactly)), layered)
         return found
 
     @functools.cached_property
@@ -169,7 +193,13 @@ class Spectra:
         light, few = self._light, self._few
         even = torch.ones(1, len(few)).to(light)
         grey = replace(self.scene, coefficients=light, spectra=even, wavelengths=few, illuminant=even[0])
-        return Spectra(self.imaging, grey, None, picture=self.picture, wavelengths=self.wavelengths)
+        return self._of_the_same_optics(grey, None)
+
+    def _of_the_same_optics(self, scene: Scene, weights: Tensor | None) -> Spectra:
+        """Of other light in the same places, which shares what is known of the optics."""
+        own = Spectra(self.imaging, scene, weights, picture=self.picture, wavelengths=self.wavelengths)
+        own._tables, own._tabled, own._line_rows = self._tables, self._tabled, self._line_rows
+        return own
 
     @functools.cached_property
     def _light(self) -> Tensor:
@@ -185,9 +215,7 @@ class Spectra:
         """Even light everywhere, in the same layers: what hides what is counted in it."""
         even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
         ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
-        masks = Spectra(self.imaging, ones, self.weights, picture=self.picture, wavelengths=self.wavelengths)
-        masks._tables, masks._tabled, masks._line_rows = self._tables, self._tabled, self._line_rows
-        return masks
+        return self._of_the_same_optics(ones, self.weights)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -209,8 +237,7 @@ class Spectra:
             known = self._table(own, vergences, wavelengths) or self._lines(own, vergences, wavelengths)
             if known is None:
                 return None
-            places = [known.wavelengths.index(one) for one in wavelengths.tolist()]
-            light = known.transfer(self.frequencies[:1], found, places).real.prod(2)  # what either side lets pass
+            light = known(self.frequencies[:1], found, wavelengths).real.prod(2)  # what either side lets pass
             if float(light.min()) < _MOST:
                 return None
         return found
@@ -237,29 +264,35 @@ class Spectra:
         few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
         return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
 
+    @functools.cached_property
+    def _every_line(self) -> Tensor:
+        """The same, and those between whose line spreads others lie."""
+        count = min(_BETWEEN_LINES, len(self.wavelengths))
+        return torch.cat([self._every, few_wavelengths(self.wavelengths, count, interpolate=True)[0]])
+
     def energies(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
     ) -> tuple[Tensor, Tensor]:
         """For each row: the energy of the difference that changes make, and that of what it is against, (B,); of
         different layers, where that has the finer ones. roughly: of windows by line spreads, of others at one
-        wavelength.
+        wavelength; cut: by those of the whole window, of which a smaller one is a part.
         """
-        off, all_of_it = self._energies(changes, against, roughly=roughly)
+        off, all_of_it = self._energies(changes, against, roughly=roughly, cut=cut)
         return off * self._unlike, all_of_it
 
     def _energies(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool, cut: bool
     ) -> tuple[Tensor, Tensor]:
         if roughly and not _differ(changes, against, WINDOW):
             changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
-            off, all_of_it = self._linear(changes, against, roughly=roughly)
+            off, all_of_it = self._linear(changes, against, roughly=roughly, cut=cut)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
             drowned = (self.hidden - _DROWNED).clamp(0, 1)
             if not _differ(changes, against, LINEAR - COLOURS):
                 return off * (1 + _COLOURED * drowned), all_of_it
-            hiding, even = self._masks._linear(changes, against, roughly=roughly)
+            hiding, even = self._masks._linear(changes, against, roughly=roughly, cut=cut)
             said = (_EDGES + drowned).clamp(max=1) * self.hidden * hiding / even.clamp(min=1e-300)
             return off + said * all_of_it, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
@@ -273,15 +306,17 @@ class Spectra:
         return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
 
     def _linear(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
         exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
-        factor = self._corners * (_BETWEEN if _differ(changes, against, {"interpolate_bands"}) else 1.0)
+        few = _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= _GROUPS
+        way = _Way(exactly, few, cut)
+        factor = self._corners * (self._between_psfs if _differ(changes, against, {"interpolate_bands"}) else 1.0)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
-            theirs, ours = (self._once(index, layered, own, against, exactly=exactly) for own in (against, changes))
+            theirs, ours = (self._once(index, layered, own, against, way) for own in (against, changes))
             found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
             if len(layered.vergences) > 1 and self._hides:
                 found[0, rows] *= self._replaced[rows] ** 2
@@ -344,14 +379,14 @@ class Spectra:
         return imaging.changed(layers=tuple((1 / vergences).tolist()))
 
     def _once(
-        self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], *, exactly: bool
+        self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], way: _Way
     ) -> Tensor:
-        key = index, exactly, str(against.get("layers")), *sorted(changes.items())
+        key = index, way, str(against.get("layers")), *sorted(changes.items())
         if key not in self._known:
             between = None
             if changes.get("layers") != against.get("layers"):
                 between = self._between(self.groups[index][1], layered.vergences, self._stage(changes))
-            self._known[key] = self._mixed(layered, changes, between, exactly=exactly)
+            self._known[key] = self._mixed(layered, changes, between, way)
         return self._known[key]
 
     def _stage(self, changes: Mapping[str, Any]) -> Imaging:
@@ -371,43 +406,53 @@ class Spectra:
         return own[present], shares[present].T
 
     def _mixed(
-        self,
-        layered: _Layered,
-        changes: Mapping[str, Any],
-        between: tuple[Tensor, Tensor] | None,
-        *,
-        exactly: bool,
+        self, layered: _Layered, changes: Mapping[str, Any], between: tuple[Tensor, Tensor] | None, way: _Way
     ) -> Tensor:
         """Of each sum of bands for each plane in each layer, (R, K Z, 2, F).
 
         between: what `_between` says of the layers of these changes, if they are others.
         """
         imaging, scene = self._stage(changes), self.scene
-        deep = is_deep(scene)
-        groups = imaging.psf_wavelengths(scene.wavelengths, deep=deep)
         vergences = layered.vergences if between is None else between[0]
-        transfer = self._transfer(imaging, vergences, groups, exactly=exactly)  # (Z, G, 2, F)
+        if between is not None and _BETWEEN_LAYERS * len(vergences) <= len(layered.vergences):
+            among = cubic_weights(layered.vergences.cpu(), vergences)
+            vergences, between = layered.vergences, (vergences, between[1] @ among)
+        groups, shares = self._colours(imaging, vergences, way)
+        transfer = self._transfer(imaging, vergences, groups, way)  # (Z, G, 2, F)
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
-        shares = imaging.shares(scene.wavelengths, deep=deep)
         shaped = torch.empty(1, transfer.shape[1], 1, 1, dtype=torch.float64)
         mixing = Renderer(shaped, spectra=spectra, weights=self.weights, picture=(1, 1), shares=shares).mixing()
         mixed = mixing.flatten(0, 1).to(transfer.dtype) @ transfer.flatten(2).transpose(0, 1).flatten(1)
         mixed = mixed.view(len(mixing), -1, len(transfer), 2, len(self.frequencies))
         return mixed.flatten(1, 2)
 
-    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, exactly: bool) -> Tensor:
+    def _colours(self, imaging: Imaging, vergences: Tensor, way: _Way) -> tuple[Tensor, Tensor | None]:
+        """Wavelengths of transfer functions, (G,), and what each gives to each band, (L, G): of the line spreads of a
+        deep scene, of which each takes its time, those of all bands and of few groups may lie between some.
+        """
+        own, deep = self.scene.wavelengths, is_deep(self.scene)
+        groups, shares = imaging.psf_wavelengths(own, deep=deep), imaging.shares(own, deep=deep)
+        alike = imaging.accuracy.blur and (shares is None or len(groups) <= _FEW_GROUPS)
+        if not (way.few and deep and alike) or way.exactly or len(own) <= _BETWEEN_LINES:
+            return groups, shares
+        if self._table(imaging, vergences, groups) or not self._lines(imaging, vergences, groups):
+            return groups, shares
+        nodes, between = few_wavelengths(torch.cat([own, groups]), _BETWEEN_LINES, interpolate=True)
+        return nodes, between[: len(own)] if shares is None else shares.to(between) @ between[len(own) :]
+
+    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: _Way) -> Tensor:
         """Slices of transfer functions along x and y, (Z, G, 2, F)."""
         if not imaging.accuracy.blur:
             return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
         window = self._window(imaging, vergences)
         known = self._table(imaging, vergences, wavelengths)
-        if known is None and not exactly:
-            known = self._lines(imaging, vergences, wavelengths)
+        if known is None and not way.exactly:
+            whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape) if way.cut else imaging
+            known = self._lines(whole, vergences, wavelengths)
         if known is not None:
-            places = [known.wavelengths.index(one) for one in wavelengths.tolist()]
-            found = known.transfer(self.frequencies, window, places).cpu()
+            found = known(self.frequencies, window, wavelengths).cpu()
         else:
             found = self._slices(imaging, vergences, wavelengths, window)
         return found / found[..., :1] if imaging.accuracy.renormalise else found
@@ -444,11 +489,19 @@ class Spectra:
         return _CUT_ROUND if query.symmetric else _CUT
 
     @functools.cached_property
+    def _between_psfs(self) -> float:
+        return _BETWEEN_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _BETWEEN
+
+    @functools.cached_property
     def _widest(self) -> Query | None:
         """The scene's ends in a whole window."""
+        return self._query(self.imaging, self._ends, self.wavelengths, self._window(self.imaging, self._ends))
+
+    @functools.cached_property
+    def _ends(self) -> Tensor:
+        """The farthest and the nearest vergence, (2,)."""
         vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
-        ends = torch.stack([vergences.min(), vergences.max()])
-        return self._query(self.imaging, ends, self.wavelengths, self._window(self.imaging, ends))
+        return torch.stack([vergences.min(), vergences.max()])
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
         if not isinstance(lens := imaging.lens, Lens):
@@ -459,11 +512,14 @@ class Spectra:
     def _table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
         """Transfer functions of these wavelengths and others, where optics know them without PSFs.
 
-        Of many layers a few wavelengths have a table, else all for which PSFs may stand.
+        Of many layers, and in grey light, a few wavelengths have a table, else all for which PSFs may stand. One layer
+        of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
         """
-        window, propagator = self._window(self.imaging, vergences), imaging.accuracy.propagator  # none is larger
+        one = is_deep(self.scene) and len(vergences) == 1
+        among = torch.cat([self._ends[:1], vergences.cpu(), self._ends[1:]]) if one else vergences
+        window, propagator = self._window(self.imaging, among), imaging.accuracy.propagator  # none is larger
         if propagator not in self._tabled:
-            query = self._query(imaging, vergences, wavelengths, window)
+            query = self._query(imaging, among, wavelengths, window)
             # in the mean over directions a window that cuts rays off is not what it is; rings reach far with little
             self._tabled[propagator] = (
                 query is not None
@@ -472,27 +528,30 @@ class Spectra:
             )
         if not self._tabled[propagator]:
             return None
-        some = self._few if len(vergences) > _FEW_LAYERS else self._every
-        if not set(wavelengths.tolist()) <= set(some.tolist()):
-            some = torch.cat([self._every, wavelengths]).unique()
+        few = len(vergences) > _FEW_LAYERS or len(self.scene.wavelengths) <= len(self._few)
+        every = torch.cat([self._every, wavelengths]).unique()
+        for some in (every, self._few):
+            key = propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
+            if key in self._tables and set(wavelengths.tolist()) <= set(some.tolist()):
+                return self._tables[key]
+        some = self._few if few and set(wavelengths.tolist()) <= set(self._few.tolist()) else every
+        query = self._query(imaging, among, some, window)
+        transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
+        if transfer is None:  # for more wavelengths another row is cheaper
+            self._tabled[propagator] = False
+            return None
         key = propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
-        if key not in self._tables:
-            query = self._query(imaging, vergences, some, window)
-            transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
-            if transfer is None:  # for more wavelengths another row is cheaper
-                self._tabled[propagator] = False
-                return None
-            self._tables[key] = _Table(some.tolist(), transfer)
-            if imaging.known is not None:
-                imaging.known.keep(key, self._tables[key])
-        return self._tables[key]
+        self._tables[key] = found = _Table(some.tolist(), transfer, middle=one)
+        if imaging.known is not None:
+            imaging.known.keep(key, found)
+        return found
 
     def _lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
-        window, some = self._window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
+        window, some = self._window(imaging, vergences), torch.cat([self._every_line, wavelengths]).unique()
         key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
-            query, like = self._query(imaging, vergences, some, window), (*key[1:3], len(vergences))
+            query, like = self._query(imaging, vergences, some, window), key[1:3]
             if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
                 self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self._few))
             lines = None if query is None else self._line_rows[like].lines(query)

@@ -76,6 +76,21 @@ def test_lines_tell_what_wavelengths_and_distances_change(kind: str, seed: int) 
             assert 0.7 < norm(ours) / norm(theirs) < 1.5, f"{norm(ours):.3g} for {norm(theirs):.3g}"
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_falls_into_a_smaller_window_is_about_told(kind: str, seed: int) -> None:
+    """To three times of what that leaves out: by the light that misses it along an axis."""
+    query = random_question(seed, kind)
+    lines, smaller = MATRIX.in_fresnel_range().lines(query), (33, 41)
+    assert lines is not None
+    psfs = MATRIX.in_fresnel_range()(query)
+    top, left = (psfs.shape[-2] - 33) // 2, (psfs.shape[-1] - 41) // 2
+    expected = slices(psfs[..., top : top + 33, left : left + 41]) - slices(psfs)
+    found = lines(FREQUENCIES, smaller, range(3)) - lines(FREQUENCIES, query.shape, range(3))
+    if norm(expected) > 3e-3:
+        assert 1 / 3 < norm(found) / norm(expected) < 3
+
+
 def test_in_focus_they_are_the_autocorrelation_of_the_disc() -> None:
     """2 / pi (arccos v - v sqrt(1 - v^2)), v = f lambda d / 2a, times the pixel's sinc (Goodman, 6.34)."""
     lens = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(50 * mm), focus_distance=math.inf)
@@ -97,4 +112,4 @@ def test_only_those_are_told_that_can_be() -> None:
     aside = Points(smooth.vergences, torch.full((2, 2), 1e-3, dtype=torch.float64))
     assert MATRIX.lines(smooth.lens.question(aside, smooth.wavelengths, smooth.grid)) is None
     with pytest.raises(ValueError, match="window"):
-        MATRIX.lines(smooth)(FREQUENCIES, (9, 9), [0])
+        MATRIX.lines(smooth)(FREQUENCIES, (9, 999), [0])

@@ -85,3 +85,17 @@ def test_wavelengths_may_be_a_list() -> None:
     for glass in ("N-BK7", Glass(1.5168, 64.2), 1.5):
         listed = refractive_index(glass, wavelengths=[450e-9, 550e-9])
         assert torch.equal(listed, refractive_index(glass, wavelengths=torch.tensor([450e-9, 550e-9]).double()))
+
+
+def test_an_index_that_is_kept_is_nobodys() -> None:
+    """Who changes it in place changes no other's, and a derivative by the wavelength passes."""
+    wavelengths = wavelength_grid()
+    first = refractive_index("N-BK7", wavelengths=wavelengths)
+    expected = first.clone()
+    first.mul_(0)
+    assert torch.equal(refractive_index("N-BK7", wavelengths=wavelengths), expected)
+    assert torch.equal(refractive_index("N-BK7", wavelengths=wavelengths[3]), expected[3])
+    trained = wavelengths.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(refractive_index("N-BK7", wavelengths=trained).sum(), trained)
+    ahead = refractive_index("N-BK7", wavelengths=wavelengths + 0.01 * nm)
+    torch.testing.assert_close(slope, (ahead - expected) / (0.01 * nm), rtol=1e-3, atol=0)

@@ -7,6 +7,7 @@ import torch
 from draws import Draw
 
 from kcam import Camera, Scene, optics, sensor
+from kcam.optics.numerics import cubic_weights
 from kcam.optics.wavelengths import few_wavelengths
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -164,3 +165,15 @@ def test_gradients_go_through_the_psfs_between() -> None:
                 values.append(float(few(scene).square().sum()))
                 zernike[index] -= step
         assert float(gradient[index]) == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
+def test_cubics_are_exact_for_what_they_are(count: int) -> None:
+    """Polynomials of as many terms as there are nodes, four at most, at nodes, between and beyond them."""
+    generator = torch.Generator().manual_seed(count)
+    nodes = torch.rand(count, dtype=torch.float64, generator=generator).sort().values
+    at = torch.cat([nodes, torch.linspace(-0.1, 1.1, 40, dtype=torch.float64)])
+    powers = torch.arange(min(count, 4))
+    weights = cubic_weights(nodes, at)
+    torch.testing.assert_close(weights @ nodes[:, None] ** powers, at[:, None] ** powers, rtol=1e-6, atol=1e-6)
+    assert int((weights.abs() > 1e-12).sum(1).max()) <= 4

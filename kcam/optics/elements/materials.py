@@ -6,10 +6,13 @@ All hold over the default bands, 420 to 720 nm, but PMMA and polycarbonate, whic
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from kcam.cache import is_plain
 
 
 @dataclass(frozen=True)
@@ -208,7 +211,20 @@ def refractive_index(glass: str | float | Glass, *, wavelengths: Tensor | list[f
         return torch.full_like(wavelengths, float(glass), dtype=torch.float64)
     if glass not in GLASSES:
         raise ValueError(f"unknown glass {glass!r}; known: {', '.join(sorted(GLASSES))}; or give a refractive index.")
-    entry = GLASSES[glass]
+    if not is_plain(wavelengths):
+        return _sellmeier(glass, GLASSES[glass], wavelengths)
+    found = _known_index(glass, GLASSES[glass], tuple(wavelengths.flatten().tolist()))
+    return found.to(wavelengths.device, copy=True).view(wavelengths.shape)
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _known_index(glass: str, entry: Sellmeier, wavelengths: tuple[float, ...]) -> Tensor:
+    """Kept, because each part of a lens asks for it, again and again."""
+    return _sellmeier(glass, entry, torch.tensor(wavelengths, dtype=torch.float64, device="cpu"))
+
+
+def _sellmeier(glass: str, entry: Sellmeier, wavelengths: Tensor) -> Tensor:
     micrometres = wavelengths.to(torch.float64) * 1e6
     low, high = entry.valid
     outside = (micrometres < low) | (micrometres > high)

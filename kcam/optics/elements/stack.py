@@ -9,6 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
+from kcam.cache import ValueCache
 from kcam.optics.elements.apertures import Aperture, rim_per_area
 from kcam.optics.elements.diffractive import DOE
 from kcam.optics.elements.element import Element, check_numbers, place_sensor
@@ -18,6 +19,7 @@ from kcam.optics.pupil.maps import PixelMap, pixel_under
 from kcam.units import check_positive, wavelength_grid
 
 _FINE = 1024  # samples on each axis that an area is summed over
+_SCATTERED = ValueCache(4)  # the last: each window asks how far pixels scatter
 _ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
 
 
@@ -117,8 +119,12 @@ class ElementStack(nn.Module):
 
         A step of delta radians between neighbours turns light by delta lambda d / 2 pi p, at most to the pixels'
         Nyquist angle; and flat pixels on a slope are a blazed grating, of whose light delta^2 / 2 pi^2 M lies beyond
-        order M.
+        order M. Without a gradient.
         """
+        with torch.no_grad():
+            return _SCATTERED.get((self, wavelengths), lambda: self._pixel_phase_displacement(wavelengths))
+
+    def _pixel_phase_displacement(self, wavelengths: Tensor) -> float:
         total = 0.0
         for pixels in self.pixel_maps(wavelengths):
             if pixels.factors is None or pixels.values.shape[-1] < 2:

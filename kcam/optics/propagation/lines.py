@@ -71,9 +71,11 @@ class LineTransfer:
         self.spreads: dict[int, Tensor] = {}
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
-        """As `row.Transfer`, of the query's own window: (Z, L, 2, F) complex128."""
+        """As `row.Transfer`, (Z, L, 2, F) complex128; of a smaller window than the query's own roughly: as if the light
+        that misses it in one direction were spread in the other as the rest is.
+        """
         query = self.query
-        if tuple(shape) != tuple(query.shape):
+        if shape[0] > query.shape[0] or shape[1] > query.shape[1]:
             raise ValueError(f"line spreads are of the window {query.shape} that was asked for, not of {shape}.")
         with torch.no_grad(), full_precision(query.device):
             for index in bands:
@@ -83,8 +85,11 @@ class LineTransfer:
             a, d = query.scale
             step = query.wavelengths[list(bands)].to(light) * d / (a * self.spacing * self.length * query.pixel_pitch)
             x = torch.fft.fftfreq(self.length, 1 / self.length, dtype=light.dtype, device=light.device)
-            halves = light.new_tensor([shape[1], shape[0]])[:, None] / 2
-            light *= ((halves / step[:, None, None] - x.abs()) + 0.5).clamp(0, 1)[:, :, None]
+            windows = light.new_tensor([query.shape[::-1], shape[::-1]])[..., None] / 2
+            inside = ((windows[:, None] / step[:, None, None] - x.abs()) + 0.5).clamp(0, 1)  # (2, L, 2, length)
+            whole, light = light * inside[..., None, :]
+            if tuple(shape) != tuple(query.shape):
+                light *= (light.sum(-1, keepdim=True) / whole.sum(-1, keepdim=True).clamp(min=1e-30)).flip(1)
             near, far = light.tensor_split([(self.length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
             asked = (frequencies.to(light)[:, None] + _FOLDS.to(light)).flatten()
