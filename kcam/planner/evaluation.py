@@ -24,6 +24,7 @@ from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import Imaging, Lens
+from kcam.optics.rendering.place import Place
 from kcam.optics.source import Defocus
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
 from kcam.planner.range import COLOUR, DEPTH, OTHER_LIGHT, shares
@@ -100,6 +101,16 @@ class Evaluator:
         self.lost: dict[int, float] = {}  # see `_cut_off`
         self.dimmed: list[float] = []  # of each signal, by blur, where it was looked at without: RMS over RMS
         self.spectra: list[Spectra] | None = None
+        self._laid_out: dict[tuple[Any, ...], tuple[Tensor, Tensor, list[Place]]] = {}
+
+    def laid_out(self, imaging: Imaging, scene: Scene) -> tuple[Tensor, Tensor, list[Place]]:
+        """Planes of one of the scenes, vergences of its layers in a stage changed from this one's, and where each is:
+        looked at once, because that takes as long as much else of a plan.
+        """
+        key = id(scene), imaging.layers, imaging.interpolate, imaging.blur, imaging.precision
+        if key not in self._laid_out:
+            self._laid_out[key] = imaging.working(scene), *imaging.filled(scene)
+        return self._laid_out[key]
 
     @functools.cached_property
     def surveys(self) -> list[list[Survey]]:

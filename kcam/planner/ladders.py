@@ -324,8 +324,7 @@ class _View:
 
     def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene, *, one: bool) -> None:
         self.imaging, self.scene, self.one = imaging, scene, one
-        planes = imaging.working(scene)
-        self.vergences, _ = imaging.filled(scene)
+        planes, self.vergences, _ = evaluator.laid_out(imaging, scene)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         self.layers = len(imaging.vergences(scene, depth)) if depth.numel() else 1
         self.bands = min(imaging.accuracy.bands or len(scene.wavelengths), len(scene.wavelengths))

@@ -16,7 +16,6 @@ from kcam.context import Stage
 from kcam.effects import Skippable, Work
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
-from kcam.optics.rendering.place import Place
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladders import Ladder, ladders
@@ -403,12 +402,11 @@ class _Prices:
     def __init__(
         self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any], *, one: bool
     ) -> None:
-        self.imaging, self.always = evaluator.imaging, always
+        self.evaluator, self.imaging, self.always = evaluator, evaluator.imaging, always
         self.apart = evaluator.apart if evaluator.varies and evaluator.samples and not one else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
         self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
-        self.known: dict[tuple[Any, ...], tuple[torch.Tensor, torch.Tensor, list[Place]]] = {}
         self.scene = scenes[0]
         if len(scenes) > 1:
             self.scene = max(scenes, key=lambda scene: self._seconds(scene))
@@ -452,10 +450,7 @@ class _Prices:
         imaging = self.imaging.changed(**self.always | dict(changes))
         known = None
         if torch.as_tensor(scene.depth).ndim != 1:  # else each distance is a picture of its own
-            key = id(scene), imaging.layers, imaging.interpolate, imaging.blur, imaging.precision
-            if key not in self.known:
-                self.known[key] = imaging.working(scene), *imaging.filled(scene)
-            known = self.known[key]
+            known = self.evaluator.laid_out(imaging, scene)
         return imaging.work(scene, channels=self.channels, apart=self.apart, known=known)
 
     def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:

@@ -139,6 +139,7 @@ class Spectra:
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._tabled: dict[Any, bool] = {}  # by propagator
         self._stages: dict[Any, Imaging] = {}  # by changes
+        self._sliced: dict[Any, Tensor] = {}  # by table, window and wavelengths
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
         self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
@@ -451,10 +452,13 @@ class Spectra:
         if known is None and not way.exactly:
             whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape) if way.cut else imaging
             known = self._lines(whole, vergences, wavelengths)
-        if known is not None:
-            found = known(self.frequencies, window, wavelengths).cpu()
-        else:
+        if known is None:
             found = self._slices(imaging, vergences, wavelengths, window)
+        else:
+            key = id(known), window, tuple(wavelengths.tolist())
+            if key not in self._sliced:
+                self._sliced[key] = known(self.frequencies, window, wavelengths).cpu()
+            found = self._sliced[key]
         return found / found[..., :1] if imaging.accuracy.renormalise else found
 
     def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
@@ -571,7 +575,7 @@ def _compressed(scene: Scene) -> Scene:
     planes = planes.to(torch.promote_types(planes.dtype, torch.float32))
     spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).to(planes)
     onto_light = torch.linalg.qr(spectra.T).R  # as long as the radiance
-    light = torch.einsum("lk,bkhw->blhw", onto_light, planes).norm(dim=1, keepdim=True)
+    light = torch.einsum("lk,bkhw->blhw", onto_light, planes).square().sum(1, keepdim=True).sqrt()
     light = light.clamp(min=torch.finfo(planes.dtype).tiny)
     flat = (planes / light.sqrt() / light.sum((-2, -1), keepdim=True).sqrt()).transpose(0, 1).flatten(1)
     energies, directions = torch.linalg.eigh((spectra.T @ (flat @ flat.T) @ spectra).double())
