@@ -190,10 +190,14 @@ class Spectra:
 
     @functools.cached_property
     def grey(self) -> Spectra:
-        """The same in grey light of a few wavelengths: depth, and what hides what, have no colour, but lenses have."""
-        light, few = self._light, self._few
-        even = torch.ones(1, len(few)).to(light)
-        grey = replace(self.scene, coefficients=light, spectra=even, wavelengths=few, illuminant=even[0])
+        """The same in light of a few wavelengths, as much of each as is recorded around it: depth, and what hides what,
+        have no colour, but lenses have.
+        """
+        stage, few = self._stage({"bands": FEW_BANDS}), self._few
+        shares = stage.shares(self.wavelengths)
+        much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
+        light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=_UNSEEN)[None].to(self._light)
+        grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
         return self._of_the_same_optics(grey, None)
 
     def _of_the_same_optics(self, scene: Scene, weights: Tensor | None) -> Spectra:
@@ -205,11 +209,21 @@ class Spectra:
     @functools.cached_property
     def _light(self) -> Tensor:
         """What is recorded of each pixel in all bands, (B, 1, H, W)."""
+        shares = self._recorded_spectra.sum(1).to(self.scene.coefficients)
+        return torch.einsum("k,bkhw->bhw", shares, self.scene.coefficients)[:, None]
+
+    @property
+    def _recorded_spectra(self) -> Tensor:
+        """What is recorded of each plane in each band, (K, L)."""
         scene = self.scene
         spectra = torch.eye(len(scene.wavelengths)) if scene.spectra is None else scene.spectra
-        weights = torch.ones(1, len(scene.wavelengths)) if self.weights is None else self.weights.abs()
-        shares = (weights.sum(0).to(spectra) @ spectra.T).to(scene.coefficients)
-        return torch.einsum("k,bkhw->bhw", shares, scene.coefficients)[:, None]
+        return spectra if self.weights is None else spectra * self.weights.abs().sum(0).to(spectra)
+
+    @functools.cached_property
+    def _recorded_bands(self) -> Tensor:
+        """What is recorded of the scene in each band, (L,)."""
+        spectra = self._recorded_spectra.double().cpu()
+        return (self.scene.coefficients.detach().sum((0, 2, 3)).double().cpu() @ spectra).clamp(min=0)
 
     @functools.cached_property
     def _masks(self) -> Spectra:
