@@ -62,7 +62,7 @@ _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
-_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.45  # times the error of PSFs between others: what cubics leave is smaller than what
+_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
 # slices tell of a PSF, and of a map of pixels, of which only some rows are looked at
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
