@@ -36,8 +36,8 @@ foretold, not seen.
 """
 
 FASTEST, FASTEST_COLOURS = 2.0, 4.0
-"""With which power of its step no ladder's error falls; of groups of wavelengths, of which a few more may be much
-better: 2.8 from one on, 4.3 from two, and 6 from two to three (36 deep scenes behind maps).
+"""With which power of its step hardly a ladder's error falls, of layers and of groups of wavelengths: of 36 deep scenes
+behind maps errors of such groups fall with 2.8 at most from one on, with 4.3 from two (6 from two to three).
 """
 
 HIDING = 9
@@ -174,11 +174,8 @@ class Ladder:
     def _lowest(self, evaluator: Evaluator, most: float) -> int:
         """The lowest rung whose error may do alone, as may those of all above it."""
         low = len(self.levels) - 1
-        if low > 0 and self.off_by > 1:
-            if (key := self._key(low - 1)) not in self.at_first:
-                self.at_first[key] = self._best(evaluator, low - 1, roughly=True, cut=True)[1]
-            if self.at_first[key] > self.off_by * most:
-                return low
+        if low > 0 and self.off_by > 1 and self._roughly(evaluator, low - 1, cut=True) > self.off_by * most:
+            return low
         while low > 0:
             self._price(evaluator, low - 1, most)
             if self._error(low - 1) > most:
@@ -224,18 +221,19 @@ class Ladder:
         best = min(range(len(errors)), key=errors.__getitem__)
         return candidates[best], max(errors[best], self.least)
 
-    def _roughly(self, evaluator: Evaluator, position: int) -> float:
-        key = self._key(position)
-        if key not in self.roughly:
-            self.roughly[key] = self._best(evaluator, position, roughly=True)[1]
-        return self.roughly[key]
+    def _roughly(self, evaluator: Evaluator, position: int, *, cut: bool = False) -> float:
+        key, known = self._key(position), self.at_first if cut else self.roughly
+        if key not in known:
+            known[key] = self._best(evaluator, position, roughly=True, cut=cut)[1]
+        return known[key]
 
     def _settled(self, roughly: float, most: float) -> bool:
         """Whether a rough estimate says enough: that this may do in any case, or in none."""
         return self.off_by * roughly <= LITTLE * most or roughly > self.off_by * most
 
     def _beyond(self, evaluator: Evaluator) -> float:
-        """What is left from here to where rungs converge, by the steps up to here: that of the foot by the next one.
+        """What is left from here to where rungs converge, by the steps up to here; at the foot, and where rungs are
+        marked, by the next one.
 
         Of order p, e = step r / (1 - r), r = (fineness below / fineness)^p; p from two steps, if there are two: that
         of their middles.
@@ -275,8 +273,8 @@ class Ladder:
         which may then do. Rungs that cannot do, at the fastest that errors fall, are not looked at.
         """
         key = self._key(self.position)
-        seen = not self.marks and self._above + 1 < len(self.levels) and key not in self.compared
-        if self.successive and self.position > 0 and seen:
+        unseen = not self.marks and self._above + 1 < len(self.levels) and key not in self.compared
+        if self.successive and self.position > 0 and unseen:
             self.compared.add(key)
             self.errors[key] = self._by_the_next(evaluator)
             return
@@ -432,7 +430,8 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
     beside = view.few(bands=0)
     successive = view.computed and not view.evaluator.tabled(beside)
-    if successive or any(is_deep(scene) for scene in view.evaluator.scenes):
+    deep = any(is_deep(scene) for scene in view.evaluator.scenes)
+    if successive or deep:
         few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]
     else:
         few = [interpolated(n) for n in node_counts(view.bands)]
@@ -446,7 +445,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         beside,
         successive=successive,
         orders=QUADRATURE,
-        fastest=FASTEST if successive else FASTEST_COLOURS,
+        fastest=FASTEST if successive else FASTEST_COLOURS if deep else None,
     )
 
 
@@ -495,7 +494,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     if not view.evaluator.by_lines(beside):
         beside, off_by = view.few(window=False, bands=ROUND), 1.0
     levels = [*levels, top]
-    yield Ladder("PSF support", levels, beside, alternatives=rescaled, off_by=off_by, from_top=True)
+    yield Ladder("PSF support", levels, beside, alternatives=rescaled, off_by=off_by, from_top=view.evaluator.certain)
 
 
 def _field(view: _View) -> Iterator[Ladder]:

@@ -197,18 +197,23 @@ class Planner:
         """
         counted = [skip for skip in skips if skip.counted]
         if self.evaluator.certain:
+            ways: list[Any] = [*steps, *counted]
             doubtful = [ladder for ladder in steps if ladder.doubtful and self.one]
             for ladder in doubtful:
                 ladder.position = len(ladder.levels) - 1
             _climb(steps, counted, self.evaluator, allowed / UNTRIED)
             for ladder in doubtful:
-                if self.prices.worth(ladder, _changes(steps)):
+                before, places = _changes(steps), [way.position for way in ways]
+                if self.prices.worth(ladder, before):
                     ladder.position = 0
                     _climb(steps, counted, self.evaluator, allowed / UNTRIED)
+                    if self.prices.of(_changes(steps))[0] > self.prices.of(before)[0]:  # others climbed for it
+                        for way, position in zip(ways, places, strict=True):
+                            way.position = position
             return None
         while True:
             _climb(steps, counted, self.evaluator, allowed / SAFETY)
-            ways: list[Any] = [*_relevant(steps), *counted]
+            ways = [*_relevant(steps), *counted]
             below = [way for way in ways if not way.at_top]
             if not below:
                 return 0.0
@@ -468,7 +473,7 @@ class _Prices:
     def worth(self, ladder: Ladder, changes: Mapping[str, Any]) -> bool:
         """Whether its cheapest rung saves more beside such changes than pricing it takes."""
         foot, beside = ladder.levels[0].changes, ladder.beside
-        saved = self.of({**changes})[0] - self.of({**changes, **foot})[0]
+        saved = self.of(changes)[0] - self.of({**changes, **foot})[0]
         return saved > self.of(beside)[0] + self.of({**beside, **foot})[0]
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -68,9 +69,8 @@ _MOST = 0.9  # of the light, that a window must hold through which it is looked 
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
-_BETWEEN_LINES, _GROUPS, _FEW_GROUPS = 12, 9, 3  # wavelengths between whose line spreads those of all bands lie, for
-# errors of up to so many groups of these, and of these groups too, for so many: such errors are 0.85 to 1.2 times those
-# of each wavelength's own (5 to 95 % of 36 deep scenes behind maps)
+_BETWEEN_LINES, _GROUPS = 12, 7  # wavelengths between whose line spreads those of all bands lie, for errors of up to so
+# many groups: such errors are 0.9 to 1.15 times those of each band's own (5 to 95 % of 36 deep scenes behind maps)
 _BETWEEN_LAYERS = 4  # times as many layers as there are in a setting, between whose transfer functions its own lie
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
@@ -282,8 +282,9 @@ class Spectra:
     @functools.cached_property
     def _every_line(self) -> Tensor:
         """The same, and those between whose line spreads others lie."""
-        count = min(_BETWEEN_LINES, len(self.wavelengths))
-        return torch.cat([self._every, few_wavelengths(self.wavelengths, count, interpolate=True)[0]])
+        if len(self.wavelengths) <= _BETWEEN_LINES or not is_deep(self.scene):
+            return self._every
+        return torch.cat([self._every, few_wavelengths(self.wavelengths, _BETWEEN_LINES, interpolate=True)[0]])
 
     def energies(
         self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
@@ -445,17 +446,14 @@ class Spectra:
 
     def _colours(self, imaging: Imaging, vergences: Tensor, way: _Way) -> tuple[Tensor, Tensor | None]:
         """Wavelengths of transfer functions, (G,), and what each gives to each band, (L, G): of the line spreads of a
-        deep scene, of which each takes its time, those of all bands and of few groups may lie between some.
+        deep scene, of which each takes its time, those of all bands may lie between some.
         """
         own, deep = self.scene.wavelengths, is_deep(self.scene)
         groups, shares = imaging.psf_wavelengths(own, deep=deep), imaging.shares(own, deep=deep)
-        alike = imaging.accuracy.blur and (shares is None or len(groups) <= _FEW_GROUPS)
-        if not (way.few and deep and alike) or way.exactly or len(own) <= _BETWEEN_LINES:
+        many = way.few and deep and not way.exactly and shares is None and len(own) > _BETWEEN_LINES
+        if not many or self._table(imaging, vergences, groups) or not self._lines(imaging, vergences, groups):
             return groups, shares
-        if self._table(imaging, vergences, groups) or not self._lines(imaging, vergences, groups):
-            return groups, shares
-        nodes, between = few_wavelengths(torch.cat([own, groups]), _BETWEEN_LINES, interpolate=True)
-        return nodes, between[: len(own)] if shares is None else shares.to(between) @ between[len(own) :]
+        return few_wavelengths(own, _BETWEEN_LINES, interpolate=True)
 
     def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: _Way) -> Tensor:
         """Slices of transfer functions along x and y, (Z, G, 2, F)."""
@@ -464,8 +462,9 @@ class Spectra:
         window = self._window(imaging, vergences)
         known = self._table(imaging, vergences, wavelengths)
         if known is None and not way.exactly:
-            whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape) if way.cut else imaging
-            known = self._lines(whole, vergences, wavelengths)
+            whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape)
+            fits = all(map(operator.le, window, self._window(whole, vergences)))  # not where others have wider ones
+            known = self._lines(whole if way.cut and fits else imaging, vergences, wavelengths)
         if known is None:
             found = self._slices(imaging, vergences, wavelengths, window)
         else:
@@ -547,18 +546,18 @@ class Spectra:
         if not self._tabled[propagator]:
             return None
         few = len(vergences) > _FEW_LAYERS or len(self.scene.wavelengths) <= len(self._few)
-        every = torch.cat([self._every, wavelengths]).unique()
-        for some in (every, self._few):
-            key = propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
-            if key in self._tables and set(wavelengths.tolist()) <= set(some.tolist()):
-                return self._tables[key]
-        some = self._few if few and set(wavelengths.tolist()) <= set(self._few.tolist()) else every
+        sets = [torch.cat([self._every, wavelengths]).unique()]
+        if set(wavelengths.tolist()) <= set(self._few.tolist()):
+            sets.append(self._few)
+        keys = [(propagator, window, tuple(vergences.tolist()), tuple(some.tolist())) for some in sets]
+        if (found := next((self._tables[key] for key in keys if key in self._tables), None)) is not None:
+            return found
+        some, key = (sets[-1], keys[-1]) if few else (sets[0], keys[0])
         query = self._query(imaging, among, some, window)
         transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
         if transfer is None:  # for more wavelengths another row is cheaper
             self._tabled[propagator] = False
             return None
-        key = propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         self._tables[key] = found = _Table(some.tolist(), transfer, middle=one)
         if imaging.known is not None:
             imaging.known.keep(key, found)

@@ -79,7 +79,7 @@ def test_lines_tell_what_wavelengths_and_distances_change(kind: str, seed: int) 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_falls_into_a_smaller_window_is_about_told(kind: str, seed: int) -> None:
-    """To three times of what that leaves out: by the light that misses it along an axis."""
+    """To two thirds of what that leaves out, by the light that misses it along either axis."""
     query = random_question(seed, kind)
     lines, smaller = MATRIX.in_fresnel_range().lines(query), (33, 41)
     assert lines is not None
@@ -88,7 +88,7 @@ def test_what_falls_into_a_smaller_window_is_about_told(kind: str, seed: int) ->
     expected = slices(psfs[..., top : top + 33, left : left + 41]) - slices(psfs)
     found = lines(FREQUENCIES, smaller, range(3)) - lines(FREQUENCIES, query.shape, range(3))
     if norm(expected) > 3e-3:
-        assert 1 / 3 < norm(found) / norm(expected) < 3
+        assert 0.9 < norm(found) / norm(expected) < 1.7
 
 
 def test_in_focus_they_are_the_autocorrelation_of_the_disc() -> None:

@@ -19,7 +19,7 @@ from kcam.optics.pupil.maps import PixelMap, pixel_under
 from kcam.units import check_positive, wavelength_grid
 
 _FINE = 1024  # samples on each axis that an area is summed over
-_SCATTERED = ValueCache(4)  # the last: each window asks how far pixels scatter
+_SCATTERED = ValueCache()  # the last: each window asks how far pixels scatter
 _ORDERS_LEFT_OUT = 3e-4  # share of the light in the grating orders of a pixel map that a default window leaves out
 
 
@@ -121,6 +121,8 @@ class ElementStack(nn.Module):
         Nyquist angle; and flat pixels on a slope are a blazed grating, of whose light delta^2 / 2 pi^2 M lies beyond
         order M. Without a gradient.
         """
+        if not self.has_pixel_phase:
+            return 0.0
         with torch.no_grad():
             return _SCATTERED.get((self, wavelengths), lambda: self._pixel_phase_displacement(wavelengths))
 

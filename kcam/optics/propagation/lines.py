@@ -46,7 +46,8 @@ def lines(query: Query) -> LineTransfer | None:
 
 
 class LineTransfer:
-    """Transfer functions of a query's window, as `row.Transfer`; of each wavelength when it is first asked for.
+    """Transfer functions of a query's window, and about those of smaller ones, as `row.Transfer`; of each wavelength
+    when it is first asked for.
 
     Differences between wavelengths, and between distances, are right to a tenth in the median, a third at worst; of
     maps of pixels they are up to a third too large, because rows are sampled.
@@ -85,17 +86,23 @@ class LineTransfer:
             a, d = query.scale
             step = query.wavelengths[list(bands)].to(light) * d / (a * self.spacing * self.length * query.pixel_pitch)
             x = torch.fft.fftfreq(self.length, 1 / self.length, dtype=light.dtype, device=light.device)
-            windows = light.new_tensor([query.shape[::-1], shape[::-1]])[..., None] / 2
-            inside = ((windows[:, None] / step[:, None, None] - x.abs()) + 0.5).clamp(0, 1)  # (2, L, 2, length)
-            whole, light = light * inside[..., None, :]
+            whole, cut = (self._inside(own, step, x) for own in (query.shape, shape))
             if tuple(shape) != tuple(query.shape):
-                light *= (light.sum(-1, keepdim=True) / whole.sum(-1, keepdim=True).clamp(min=1e-30)).flip(1)
+                shares = (light * cut).sum(-1) / (light * whole).sum(-1).clamp(min=1e-30)
+                light *= shares.flip(1)[..., None]
+            light *= cut
             near, far = light.tensor_split([(self.length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
             asked = (frequencies.to(light)[:, None] + _FOLDS.to(light)).flatten()
             active = query.grid.active if query.grid.integrate else 0.0
             found = _between(table, asked * (2 * self.length * step)[:, None]) * torch.sinc(asked * active)
             return found.unflatten(-1, (-1, len(_FOLDS))).sum(-1).permute(2, 0, 1, 3)
+
+    @staticmethod
+    def _inside(shape: tuple[int, int], step: Tensor, x: Tensor) -> Tensor:
+        """What of the light at so many steps (N,), of (L,) pixels, falls into a window along x and y, (L, 2, 1, N)."""
+        halves = step.new_tensor([shape[1], shape[0]])[:, None] / 2
+        return (halves / step[:, None, None] - x.abs() + 0.5).clamp(0, 1)[:, :, None]
 
     def _spread(self, index: int) -> Tensor:
         """The light at each step along x and y from the middle on, then of those before it: (2, Z, length)."""

@@ -45,8 +45,8 @@ class Propagator(nn.Module):
         exact: whether only sampling separates the row from its physics, so that it may be chosen by cost alone.
         on_grid: whether it samples the pupil on a Cartesian grid, of so many samples as `Query.samples` says.
         transfer: query -> `Transfer`, where transfer functions are known without the PSFs.
-        lines: query -> `Transfer` for the window of the query alone, or None, for estimates: right enough to tell what
-            other wavelengths and distances change, see `LineTransfer`.
+        lines: query -> `Transfer`, or None, for estimates: right enough to tell what other wavelengths and distances
+            change in the window of the query, and in smaller ones to a factor of 2, see `LineTransfer`.
         about: what it does, in a line of the documentation.
     Raises: ValueError for a rate that is not > 0.
     """
