@@ -10,7 +10,8 @@ FEW_BANDS = 2
 
 GREY: dict[str, Any] = {"bands": 1}
 """Light of one wavelength. What a window costs in it, times what line spreads say of a few and of one, is 0.77 to 1.2
-times what it costs in all (5 to 95 % of 55 windows of 20 random pairs).
+times what it costs in all (5 to 95 % of 55 windows of 20 random pairs); less of a lens that this one sees in focus, see
+`ladders.COLOURFUL`.
 """
 
 GRIDS = 3

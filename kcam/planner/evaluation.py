@@ -28,7 +28,7 @@ from kcam.optics.rendering.place import Place
 from kcam.optics.source import Defocus
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
 from kcam.planner.range import COLOUR, DEPTH, OTHER_LIGHT, shares
-from kcam.planner.spectra import LINEAR, Spectra, linear
+from kcam.planner.spectra import LINEAR, Care, Spectra, linear
 from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, Mosaic, Transmission
@@ -227,13 +227,10 @@ class Evaluator:
         """Whether line spreads tell roughly what a window costs."""
         return self.spectra is not None and all(spectra.by_lines(settings) for spectra in self.spectra)
 
-    def error(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
-    ) -> float:
+    def error(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL) -> float:
         """Relative RMS of the raw (and gradients) of one setting against another's, the worst over the scenes.
 
-        By spectra light beyond the full well counts too, so that they say at least as much. roughly, cut: see
-        `Spectra.energies`.
+        By spectra light beyond the full well counts too, so that they say at least as much.
         """
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
             return _error(self.samples, self.answers(changes), self.answers(against))
@@ -241,7 +238,7 @@ class Evaluator:
             return self._hidden(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
-            found += self._relative(sample, torch.stack(spectra.energies(changes, against, roughly=roughly, cut=cut)))
+            found += self._relative(sample, torch.stack(spectra.energies(changes, against, care)))
         return max(found)
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:

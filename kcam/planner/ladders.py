@@ -19,6 +19,7 @@ from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GREY, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
+from kcam.planner.spectra import Care
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -60,6 +61,8 @@ LITTLE = 1 / 2
 
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
+
+ROUGH = Care.ROUGH, Care.AT_FIRST
 
 EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
 """Models. What other choices cost is the same in both, to 10 % (of 24 maps of pixels, f/5 to f/50)."""
@@ -125,8 +128,7 @@ class Ladder:
     urgency: float = 1.0
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
-    at_first: dict[tuple[int, int], float] = field(default_factory=dict)
-    roughly: dict[tuple[int, int], float] = field(default_factory=dict)
+    roughly: dict[Care, dict[tuple[int, int], float]] = field(default_factory=lambda: {care: {} for care in ROUGH})
     grey: dict[tuple[int, int], float] = field(default_factory=dict)
     compared: set[tuple[int, int]] = field(default_factory=set)
 
@@ -152,7 +154,7 @@ class Ladder:
         if position == len(self.levels) - 1:
             return 0.0
         known = self.errors if key in self.errors else self.grey
-        return max(known[key], self.least) if key in known else self.off_by * self.roughly[key]
+        return max(known[key], self.least) if key in known else self.off_by * self.roughly[Care.ROUGH][key]
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -174,7 +176,7 @@ class Ladder:
     def _lowest(self, evaluator: Evaluator, most: float) -> int:
         """The lowest rung whose error may do alone, as may those of all above it."""
         low = len(self.levels) - 1
-        if low > 0 and self.off_by > 1 and self._roughly(evaluator, low - 1, cut=True) > self.off_by * most:
+        if low > 0 and self.off_by > 1 and self._roughly(evaluator, low - 1, Care.AT_FIRST) > self.off_by * most:
             return low
         while low > 0:
             self._price(evaluator, low - 1, most)
@@ -204,27 +206,27 @@ class Ladder:
         much, of a lens that one wavelength sees in focus, halfway to what is said of these few.
         """
         roughly = self._roughly(evaluator, position)
-        grey = self._best(evaluator, position, roughly=True, **GREY)[1]
+        grey = self._best(evaluator, position, Care.ROUGH, **GREY)[1]
         more = max(1.0, roughly / grey) if grey else 1.0
         error = self.grey[self._key(position)] * more
         return error if more < COLOURFUL else max(error, math.sqrt(error * roughly))
 
     def _best(
-        self, evaluator: Evaluator, position: int, *, roughly: bool = False, cut: bool = False, **settings: Any
+        self, evaluator: Evaluator, position: int, care: Care = Care.FULL, **settings: Any
     ) -> tuple[Level, float]:
         """Of a rung and its alternatives that with the smallest error; settings: beside its own."""
         beside = self.beside | settings | (self.follows.levels[self._followed].changes if self.follows else {})
         level = self.levels[position]
         candidates = [level] + (self.alternatives(level) if self.alternatives else [])
         top = beside | self.levels[-1].changes
-        errors = [evaluator.error(beside | level.changes, top, roughly=roughly, cut=cut) for level in candidates]
+        errors = [evaluator.error(beside | level.changes, top, care) for level in candidates]
         best = min(range(len(errors)), key=errors.__getitem__)
         return candidates[best], max(errors[best], self.least)
 
-    def _roughly(self, evaluator: Evaluator, position: int, *, cut: bool = False) -> float:
-        key, known = self._key(position), self.at_first if cut else self.roughly
+    def _roughly(self, evaluator: Evaluator, position: int, care: Care = Care.ROUGH) -> float:
+        key, known = self._key(position), self.roughly[care]
         if key not in known:
-            known[key] = self._best(evaluator, position, roughly=True, cut=cut)[1]
+            known[key] = self._best(evaluator, position, care)[1]
         return known[key]
 
     def _settled(self, roughly: float, most: float) -> bool:
@@ -294,7 +296,7 @@ class Ladder:
         """The number that decided."""
         if self.position == 0:
             return "" if len(self.levels) == 1 else "the least there is suffices"
-        known = self.at_first | self.roughly | self.grey | self.errors
+        known = self.roughly[Care.AT_FIRST] | self.roughly[Care.ROUGH] | self.grey | self.errors
         below = max((key for key in known if key[0] < self.position), default=None)
         if below is None:
             return "would save less time than it takes to find out"

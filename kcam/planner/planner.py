@@ -49,11 +49,12 @@ def make_plan(
 ) -> Plan:
     """The cheapest physics found whose raw stays within a tolerance of the camera's own, for the worst of the scenes.
 
-    A plan starts at the foot of all ladders (`LADDERS`) and climbs, one rung at a time, that with the largest error,
-    until all errors together are below the tolerance / `UNTRIED`. Where the raw is linear in the light but for the
-    full well, those follow from spectra. Else (PSFs that vary over the picture, gradients) they are tried out, and the
-    way goes on until a last trial is below the tolerance / `SAFETY`: the whole plan against the reference, each item of
-    each batch by itself. Beyond `evaluation.WITNESSED` pixels it sees only the worst of them.
+    A plan starts at the foot of all ladders (`LADDERS`), of windows at the smallest that may do alone, and climbs, one
+    rung at a time, that with the largest error, until all errors together are below the tolerance / `UNTRIED`. Where
+    the raw is linear in the light but for the full well, those follow from spectra. Else (PSFs that vary over the
+    picture, gradients) they are tried out, and the way goes on until a last trial is below the tolerance / `SAFETY`:
+    the whole plan against the reference, each item of each batch by itself. Beyond `evaluation.WITNESSED` pixels it
+    sees only the worst of them.
 
     Args:      scenes: one or several, of the same wavelengths.
                tolerance: relative RMS of the noiseless raw, >= 0; 0 gives the reference physics. "sensor": what this

@@ -13,6 +13,7 @@ of it where that is much.
 from __future__ import annotations
 
 import contextlib
+import enum
 import functools
 import math
 import operator
@@ -85,6 +86,14 @@ class _Layered:
 
     vergences: Tensor
     crossed: Tensor
+
+
+class Care(enum.Enum):
+    """With how much an error is estimated."""
+
+    FULL = enum.auto()
+    ROUGH = enum.auto()  # of windows by line spreads, of others at one wavelength
+    AT_FIRST = enum.auto()  # of windows by line spreads of the whole, of which a smaller one is a part
 
 
 class _Way(NamedTuple):
@@ -287,28 +296,25 @@ class Spectra:
         return torch.cat([self._every, few_wavelengths(self.wavelengths, _BETWEEN_LINES, interpolate=True)[0]])
 
     def energies(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
         """For each row: the energy of the difference that changes make, and that of what it is against, (B,); of
-        different layers, where that has the finer ones. roughly: of windows by line spreads, of others at one
-        wavelength; cut: by those of the whole window, of which a smaller one is a part.
+        different layers, where that has the finer ones.
         """
-        off, all_of_it = self._energies(changes, against, roughly=roughly, cut=cut)
+        off, all_of_it = self._energies(changes, against, care)
         return off * self._unlike, all_of_it
 
-    def _energies(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool, cut: bool
-    ) -> tuple[Tensor, Tensor]:
-        if roughly and not _differ(changes, against, WINDOW):
+    def _energies(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> tuple[Tensor, Tensor]:
+        if care is not Care.FULL and not _differ(changes, against, WINDOW):
             changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
-            off, all_of_it = self._linear(changes, against, roughly=roughly, cut=cut)
+            off, all_of_it = self._linear(changes, against, care)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
             drowned = (self.hidden - _DROWNED).clamp(0, 1)
             if not _differ(changes, against, LINEAR - COLOURS):
                 return off * (1 + _COLOURED * drowned), all_of_it
-            hiding, even = self._masks._linear(changes, against, roughly=roughly, cut=cut)
+            hiding, even = self._masks._linear(changes, against, care)
             said = (_EDGES + drowned).clamp(max=1) * self.hidden * hiding / even.clamp(min=1e-300)
             return off + said * all_of_it, all_of_it
         return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
@@ -322,12 +328,12 @@ class Spectra:
         return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
 
     def _linear(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], *, roughly: bool = False, cut: bool = False
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        exactly = _differ(changes, against, WITH_PSFS - WINDOW if roughly else WITH_PSFS)
+        exactly = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - WINDOW)
         few = _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= _GROUPS
-        way = _Way(exactly, few, cut)
+        way = _Way(exactly, few, care is Care.AT_FIRST)
         factor = self._corners * (self._between_psfs if _differ(changes, against, {"interpolate_bands"}) else 1.0)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
