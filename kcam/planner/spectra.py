@@ -16,10 +16,9 @@ import contextlib
 import enum
 import functools
 import math
-import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,17 +26,14 @@ from torch.nn import functional
 
 from kcam.camera import Camera
 from kcam.isp import Clip
-from kcam.optics import Imaging, Lens
+from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
 from kcam.optics.numerics import cubic_weights
-from kcam.optics.propagation.question import Query
-from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
-from kcam.optics.source import Points
-from kcam.optics.wavelengths import few_wavelengths
-from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
-from kcam.planner.cross_spectra import cross_spectra, rings
+from kcam.planner.band_counts import FEW_BANDS
+from kcam.planner.cross_spectra import cross_spectra
+from kcam.planner.transfers import GROUPS, Transfers, Way
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, ShotNoise, Transmission
 from kcam.sensor.mosaic import pattern_tile
@@ -62,18 +58,10 @@ _SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the p
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
 _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
-_CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
-# and a round one: no slice knows its corners. Pixels scatter into all directions alike
-_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
-# slices tell of a PSF, and of a map of pixels, of which only some rows are looked at
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
-_AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
-_BETWEEN_LINES, _GROUPS = 12, 7  # wavelengths between whose line spreads those of all bands lie, for errors of up to so
-# many groups: such errors are 0.9 to 1.15 times those of each band's own (5 to 95 % of 36 deep scenes behind maps)
 _BETWEEN_LAYERS = 4  # times as many layers as there are in a setting, between whose transfer functions its own lie
-_FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
 
@@ -96,69 +84,32 @@ class Care(enum.Enum):
     AT_FIRST = enum.auto()  # of windows by line spreads of the whole, of which a smaller one is a part
 
 
-class _Way(NamedTuple):
-    """How transfer functions are found. exactly: by PSFs or tables; else by line spreads, where there are any. few: of
-    wavelengths between some. cut: in a smaller window, by those of the whole.
-    """
-
-    exactly: bool = False
-    few: bool = False
-    cut: bool = False
-
-
-@dataclass(frozen=True)
-class _Table:
-    """Wavelengths, and their transfer functions; middle: of three distances, of which the one in the middle counts."""
-
-    wavelengths: list[float]
-    transfer: Transfer
-    middle: bool = False
-
-    def __call__(self, frequencies: Tensor, window: tuple[int, int], wavelengths: Tensor) -> Tensor:
-        """At frequencies (F,) and some of the wavelengths (L,), (Z, L, 2, F)."""
-        places = [self.wavelengths.index(one) for one in wavelengths.tolist()]
-        found = self.transfer(frequencies, window, places)
-        return found[1:2] if self.middle else found
-
-
 class Spectra:
     """A batch of scenes as spectra, before optics and sums over the bands (R, L) that a sensor records, or all bands.
 
-    picture: (H, W) of the wholes that they are part of. wavelengths: of the light, of which the scene may have a few.
-    hidden: of each row, the energy of the light that something nearer may hide, of what is recorded, for each share of
-    the pixels that is, (B,); None where that does not count.
+    scene: whose light may be of a few wavelengths of those that the optics are for. hidden: of each row, the energy of
+    the light that something nearer may hide, of what is recorded, for each share of the pixels that is, (B,); None
+    where that does not count.
     """
 
     def __init__(
-        self,
-        imaging: Imaging,
-        scene: Scene,
-        weights: Tensor | None,
-        *,
-        picture: tuple[int, int],
-        wavelengths: Tensor,
-        hidden: Tensor | None = None,
+        self, optics: Transfers, scene: Scene, weights: Tensor | None, *, hidden: Tensor | None = None
     ) -> None:
-        self.imaging, self.scene, self.weights = imaging, scene, weights
-        self.picture, self.wavelengths, self.hidden = picture, wavelengths, hidden
-        self.frequencies = rings()
+        self.optics, self.imaging, self.wavelengths = optics, optics.imaging, optics.wavelengths
+        self.scene, self.weights, self.hidden = scene, weights, hidden
+        self.frequencies = optics.frequencies
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._unlike = torch.ones(len(scene.coefficients), dtype=torch.float64)  # see `compare`
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
-        self._tabled: dict[Any, bool] = {}  # by propagator
-        self._stages: dict[Any, Imaging] = {}  # by changes
-        self._sliced: dict[Any, Tensor] = {}  # by table, window and wavelengths
-        self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
-        self._tables: dict[Any, _Table | None] = {} if imaging.known is None else dict(imaging.known.others)
 
     @classmethod
     def of(
         cls, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int], hidden: Tensor | None = None
     ) -> Spectra:
         """Those before a camera."""
-        recorded, wavelengths = _recorded(camera, scene), scene.wavelengths
-        return cls(imaging, _compressed(scene), recorded, picture=picture, wavelengths=wavelengths, hidden=hidden)
+        light = _compressed(scene)
+        return cls(Transfers(imaging, light, picture), light, _recorded(camera, scene), hidden=hidden)
 
     def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> bool:
         """Take what pixels truly record with some settings, the energy of each row (B,), for what errors are relative
@@ -194,7 +145,7 @@ class Spectra:
         found = torch.zeros(len(self.scene.coefficients), dtype=torch.float64)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, settings.get("layers"))
-            found[rows] = self._energy(self._once(index, layered, settings, settings, _Way(exactly)), layered)
+            found[rows] = self._energy(self._once(index, layered, settings, settings, Way(exactly)), layered)
         return found
 
     @functools.cached_property
@@ -202,18 +153,12 @@ class Spectra:
         """The same in light of a few wavelengths, as much of each as is recorded around it: depth, and what hides what,
         have no colour, but lenses have.
         """
-        stage, few = self._stage({"bands": FEW_BANDS}), self._few
+        stage, few = self.optics.stage({"bands": FEW_BANDS}), self.optics.few
         shares = stage.shares(self.wavelengths)
         much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
         light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=_UNSEEN)[None].to(self._light)
         grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
-        return self._of_the_same_optics(grey, None)
-
-    def _of_the_same_optics(self, scene: Scene, weights: Tensor | None) -> Spectra:
-        """Of other light in the same places, which shares what is known of the optics."""
-        own = Spectra(self.imaging, scene, weights, picture=self.picture, wavelengths=self.wavelengths)
-        own._tables, own._tabled, own._line_rows = self._tables, self._tabled, self._line_rows
-        return own
+        return Spectra(self.optics, grey, None)
 
     @functools.cached_property
     def _light(self) -> Tensor:
@@ -239,61 +184,43 @@ class Spectra:
         """Even light everywhere, in the same layers: what hides what is counted in it."""
         even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
         ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
-        return self._of_the_same_optics(ones, self.weights)
+        return Spectra(self.optics, ones, self.weights)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
-        return all(table or self._lines(*asked) for table, asked in self._at_once(settings))
+        return all(self.optics.table(*asked) or self.optics.lines(*asked) for asked in self._at_once(settings))
+
+    def by_lines(self, settings: Mapping[str, Any]) -> bool:
+        """Whether those that are known at once are line spreads."""
+        asked = [*self._at_once(settings)]
+        return all(self.optics.table(*one) is None and self.optics.lines(*one) is not None for one in asked)
+
+    def _at_once(self, settings: Mapping[str, Any]) -> Iterator[tuple[Imaging, Tensor, Tensor]]:
+        imaging = self.optics.stage(settings)
+        for index in range(len(self.groups)):
+            yield imaging, self._of(index, settings.get("layers")).vergences, self.optics.few
 
     def narrow(self, settings: Mapping[str, Any], side: int) -> tuple[int, int] | None:
         """The middle of wide windows, so many pixels at most, where that holds most of the light with some settings, as
         far as it is known without PSFs.
         """
-        imaging, found = self._stage(settings), (0, 0)
-        wavelengths = imaging.psf_wavelengths(self.wavelengths, deep=is_deep(self.scene))
+        optics, found = self.optics, (0, 0)
+        imaging = optics.stage(settings)
+        wavelengths = imaging.psf_wavelengths(self.wavelengths, deep=optics.deep)
         for index in range(len(self.groups)):
             vergences = self._of(index, settings.get("layers")).vergences
-            window = self._window(imaging, vergences)
+            window = optics.window(imaging, vergences)
             if max(window) <= 2 * side:  # less wide ones take no longer than it takes to know
                 return None
             found = min(side, window[0]), min(side, window[1])
             own = imaging.changed(psf_shape=found)
-            known = self._table(own, vergences, wavelengths) or self._lines(own, vergences, wavelengths)
+            known = optics.table(own, vergences, wavelengths) or optics.lines(own, vergences, wavelengths)
             if known is None:
                 return None
             light = known(self.frequencies[:1], found, wavelengths).real.prod(2)  # what either side lets pass
             if float(light.min()) < _MOST:
                 return None
         return found
-
-    def by_lines(self, settings: Mapping[str, Any]) -> bool:
-        """Whether those that are known at once are line spreads."""
-        return all(table is None and self._lines(*asked) is not None for table, asked in self._at_once(settings))
-
-    def _at_once(self, settings: Mapping[str, Any]) -> Iterator[tuple[_Table | None, tuple[Imaging, Tensor, Tensor]]]:
-        imaging = self._stage(settings)
-        for index in range(len(self.groups)):
-            asked = imaging, self._of(index, settings.get("layers")).vergences, self._few
-            yield self._table(*asked), asked
-
-    @functools.cached_property
-    def _few(self) -> Tensor:
-        return self.imaging.changed(bands=FEW_BANDS).psf_wavelengths(self.wavelengths)
-
-    @functools.cached_property
-    def _every(self) -> Tensor:
-        """All wavelengths at which PSFs may stand for those of others."""
-        own, deep = self.wavelengths, is_deep(self.scene)
-        few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
-        few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
-        return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
-
-    @functools.cached_property
-    def _every_line(self) -> Tensor:
-        """The same, and those between whose line spreads others lie."""
-        if len(self.wavelengths) <= _BETWEEN_LINES or not is_deep(self.scene):
-            return self._every
-        return torch.cat([self._every, few_wavelengths(self.wavelengths, _BETWEEN_LINES, interpolate=True)[0]])
 
     def energies(
         self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
@@ -332,9 +259,11 @@ class Spectra:
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
         exactly = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - WINDOW)
-        few = _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= _GROUPS
-        way = _Way(exactly, few, care is Care.AT_FIRST)
-        factor = self._corners * (self._between_psfs if _differ(changes, against, {"interpolate_bands"}) else 1.0)
+        few = _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= GROUPS
+        way = Way(exactly, few, care is Care.AT_FIRST)
+        factor = self.optics.corners
+        if _differ(changes, against, {"interpolate_bands"}):
+            factor *= self.optics.between_psfs
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
@@ -368,7 +297,7 @@ class Spectra:
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
         far, near = (defocus.radius(end) - defocus.floor for end in ends)
-        wide = (near > min(self.picture) / 2) & (far < near / 2)
+        wide = (near > min(self.optics.picture) / 2) & (far < near / 2)
         return torch.where(wide, _SEEN_THROUGH, found)
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
@@ -401,22 +330,15 @@ class Spectra:
         return imaging.changed(layers=tuple((1 / vergences).tolist()))
 
     def _once(
-        self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], way: _Way
+        self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], way: Way
     ) -> Tensor:
         key = index, way, str(against.get("layers")), *sorted(changes.items())
         if key not in self._known:
             between = None
             if changes.get("layers") != against.get("layers"):
-                between = self._between(self.groups[index][1], layered.vergences, self._stage(changes))
+                between = self._between(self.groups[index][1], layered.vergences, self.optics.stage(changes))
             self._known[key] = self._mixed(layered, changes, between, way)
         return self._known[key]
-
-    def _stage(self, changes: Mapping[str, Any]) -> Imaging:
-        """With changes: kept, because each setting is asked about often."""
-        key = tuple(sorted(changes.items()))
-        if key not in self._stages:
-            self._stages[key] = self.imaging.changed(**changes)
-        return self._stages[key]
 
     def _between(self, scene: Scene, vergences: Tensor, imaging: Imaging) -> tuple[Tensor, Tensor]:
         """Vergences (Y,) of the layers of a stage, and what each of others, (Z,), takes from these, (Z, Y)."""
@@ -428,19 +350,18 @@ class Spectra:
         return own[present], shares[present].T
 
     def _mixed(
-        self, layered: _Layered, changes: Mapping[str, Any], between: tuple[Tensor, Tensor] | None, way: _Way
+        self, layered: _Layered, changes: Mapping[str, Any], between: tuple[Tensor, Tensor] | None, way: Way
     ) -> Tensor:
         """Of each sum of bands for each plane in each layer, (R, K Z, 2, F).
 
         between: what `_between` says of the layers of these changes, if they are others.
         """
-        imaging, scene = self._stage(changes), self.scene
+        imaging, scene = self.optics.stage(changes), self.scene
         vergences = layered.vergences if between is None else between[0]
         if between is not None and _BETWEEN_LAYERS * len(vergences) <= len(layered.vergences):
             among = cubic_weights(layered.vergences.cpu(), vergences)
             vergences, between = layered.vergences, (vergences, between[1] @ among)
-        groups, shares = self._colours(imaging, vergences, way)
-        transfer = self._transfer(imaging, vergences, groups, way)  # (Z, G, 2, F)
+        transfer, shares = self.optics.of(imaging, vergences, scene.wavelengths, way)
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
         spectra = None if scene.spectra is None else scene.spectra.double().cpu()
@@ -450,136 +371,10 @@ class Spectra:
         mixed = mixed.view(len(mixing), -1, len(transfer), 2, len(self.frequencies))
         return mixed.flatten(1, 2)
 
-    def _colours(self, imaging: Imaging, vergences: Tensor, way: _Way) -> tuple[Tensor, Tensor | None]:
-        """Wavelengths of transfer functions, (G,), and what each gives to each band, (L, G): of the line spreads of a
-        deep scene, of which each takes its time, those of all bands may lie between some.
-        """
-        own, deep = self.scene.wavelengths, is_deep(self.scene)
-        groups, shares = imaging.psf_wavelengths(own, deep=deep), imaging.shares(own, deep=deep)
-        many = way.few and deep and not way.exactly and shares is None and len(own) > _BETWEEN_LINES
-        if not many or self._table(imaging, vergences, groups) or not self._lines(imaging, vergences, groups):
-            return groups, shares
-        return few_wavelengths(own, _BETWEEN_LINES, interpolate=True)
-
-    def _transfer(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: _Way) -> Tensor:
-        """Slices of transfer functions along x and y, (Z, G, 2, F)."""
-        if not imaging.accuracy.blur:
-            return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
-        window = self._window(imaging, vergences)
-        known = self._table(imaging, vergences, wavelengths)
-        if known is None and not way.exactly:
-            whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape)
-            fits = all(map(operator.le, window, self._window(whole, vergences)))  # not where others have wider ones
-            known = self._lines(whole if way.cut and fits else imaging, vergences, wavelengths)
-        if known is None:
-            found = self._slices(imaging, vergences, wavelengths, window)
-        else:
-            key = id(known), window, tuple(wavelengths.tolist())
-            if key not in self._sliced:
-                self._sliced[key] = known(self.frequencies, window, wavelengths).cpu()
-            found = self._sliced[key]
-        return found / found[..., :1] if imaging.accuracy.renormalise else found
-
-    def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
-        pixels = imaging.pixels(window, imaging.working(self.scene)[:, :0])
-        bank = imaging.bank(Points(vergences), wavelengths, pixels)
-        slices = []
-        for dim in (-2, -1):
-            along = bank.sum(dim, dtype=torch.float64).cpu()
-            x = torch.arange(along.shape[-1], dtype=torch.float64) - along.shape[-1] // 2
-            slices.append(along.to(torch.complex128) @ torch.exp(-2j * math.pi * x[:, None] * self.frequencies))
-        return torch.stack(slices, dim=2)
-
-    def _window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
-        return imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
-
     @property
     def _hides(self) -> bool:
         """Whether one part of the scene may hide another."""
         return self.imaging.accuracy.occlusion and is_deep(self.scene)
-
-    @functools.cached_property
-    def fits(self) -> bool:
-        """Whether the window of a whole PSF cuts nothing but diffraction off."""
-        return self._widest is None or _inside(self._widest)
-
-    @functools.cached_property
-    def _corners(self) -> float:
-        """Times the error along x and y that there is in the mean, at most."""
-        query = self._widest
-        if query is None or query.has_pixel_phase or self.fits:
-            return 1.0
-        return _CUT_ROUND if query.symmetric else _CUT
-
-    @functools.cached_property
-    def _between_psfs(self) -> float:
-        return _BETWEEN_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _BETWEEN
-
-    @functools.cached_property
-    def _widest(self) -> Query | None:
-        """The scene's ends in a whole window."""
-        return self._query(self.imaging, self._ends, self.wavelengths, self._window(self.imaging, self._ends))
-
-    @functools.cached_property
-    def _ends(self) -> Tensor:
-        """The farthest and the nearest vergence, (2,)."""
-        vergences = (1 / torch.as_tensor(self.scene.depth, dtype=torch.float64)).flatten().cpu()
-        return torch.stack([vergences.min(), vergences.max()])
-
-    def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
-        if not isinstance(lens := imaging.lens, Lens):
-            return None
-        pixels = imaging.pixels(window, torch.empty(0, dtype=torch.float64))
-        return lens.question(Points(vergences), wavelengths, pixels, imaging.accuracy)
-
-    def _table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
-        """Transfer functions of these wavelengths and others, where optics know them without PSFs.
-
-        Of many layers, and in grey light, a few wavelengths have a table, else all for which PSFs may stand. One layer
-        of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
-        """
-        one = is_deep(self.scene) and len(vergences) == 1
-        among = torch.cat([self._ends[:1], vergences.cpu(), self._ends[1:]]) if one else vergences
-        window, propagator = self._window(self.imaging, among), imaging.accuracy.propagator  # none is larger
-        if propagator not in self._tabled:
-            query = self._query(imaging, among, wavelengths, window)
-            # in the mean over directions a window that cuts rays off is not what it is; rings reach far with little
-            self._tabled[propagator] = (
-                query is not None
-                and imaging.accuracy.row(query).transfer_of is not None
-                and (self.fits or query.has_rings)
-            )
-        if not self._tabled[propagator]:
-            return None
-        few = len(vergences) > _FEW_LAYERS or len(self.scene.wavelengths) <= len(self._few)
-        sets = [torch.cat([self._every, wavelengths]).unique()]
-        if set(wavelengths.tolist()) <= set(self._few.tolist()):
-            sets.append(self._few)
-        keys = [(propagator, window, tuple(vergences.tolist()), tuple(some.tolist())) for some in sets]
-        if (found := next((self._tables[key] for key in keys if key in self._tables), None)) is not None:
-            return found
-        some, key = (sets[-1], keys[-1]) if few else (sets[0], keys[0])
-        query = self._query(imaging, among, some, window)
-        transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
-        if transfer is None:  # for more wavelengths another row is cheaper
-            self._tabled[propagator] = False
-            return None
-        self._tables[key] = found = _Table(some.tolist(), transfer, middle=one)
-        if imaging.known is not None:
-            imaging.known.keep(key, found)
-        return found
-
-    def _lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> _Table | None:
-        """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
-        window, some = self._window(imaging, vergences), torch.cat([self._every_line, wavelengths]).unique()
-        key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
-        if key not in self._tables:
-            query, like = self._query(imaging, vergences, some, window), key[1:3]
-            if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
-                self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self._few))
-            lines = None if query is None else self._line_rows[like].lines(query)
-            self._tables[key] = None if lines is None else _Table(some.tolist(), lines)
-        return self._tables[key]
 
 
 def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
@@ -605,11 +400,6 @@ def _compressed(scene: Scene) -> Scene:
             with contextlib.suppress(ValueError):  # light would be negative somewhere, by more than a scene lets pass
                 return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, spectra @ few), spectra=few.T)
     return scene
-
-
-def _inside(query: Query) -> bool:
-    """Whether all rays fall well inside the window."""
-    return float(query.displacement.max()) < (min(query.shape) // 2 - _AROUND) * query.pixel_pitch
 
 
 def _lights(light: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from benchmarks.planner import random_pair
 from kcam import Camera, Scene, optics, sensor
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
-from kcam.planner import Planner, costs
+from kcam.planner import Planner, costs, transfers
 from kcam.planner import spectra as spectra_module
 from kcam.planner.band_counts import group_counts, node_counts
 from kcam.planner.evaluation import Evaluator, _error
@@ -51,7 +51,10 @@ def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
         evaluator = Evaluator(camera, [scene])
         evaluator.look({"bands": 3})
         assert evaluator.spectra is not None
-        flat, fits = not isinstance(scene.depth, torch.Tensor), all(spectra.fits for spectra in evaluator.spectra)
+        flat, fits = (
+            not isinstance(scene.depth, torch.Tensor),
+            all(spectra.optics.fits for spectra in evaluator.spectra),
+        )
         seen = max(evaluator.lost.values()) < 1.01
         for ours, theirs in CHANGES if flat else CHANGES + OF_DEPTH:
             trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers(theirs))
@@ -71,7 +74,7 @@ def test_line_spreads_of_all_wavelengths_lie_between_a_few(seed: int, monkeypatc
     camera, scene, *_ = random_pair(seed)
     found = []
     for between in (12, 99):
-        monkeypatch.setattr(spectra_module, "_BETWEEN_LINES", between)
+        monkeypatch.setattr(transfers, "_BETWEEN_LINES", between)
         with torch.no_grad():
             planner = Planner(camera, scene, one=True)
             planner.plan(0.01)

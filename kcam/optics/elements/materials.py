@@ -27,6 +27,10 @@ class Sellmeier:
     valid: tuple[float, float]
     source: str
 
+    def __post_init__(self) -> None:
+        for name in ("b", "c", "valid"):  # lists, too, and then it is hashable
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
 
 D_F_C = (0.5875618, 0.4861327, 0.6562725)
 """Fraunhofer lines that nd and vd are of [um]."""

@@ -1,0 +1,236 @@
+"""What the optics of a stage do to light in rings of frequency, for estimates: slices of transfer functions along x and
+y, from tables or line spreads where there are any, else from PSFs; each is computed once.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcam.optics import Imaging, Lens
+from kcam.optics.imaging import is_deep
+from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.row import Propagator, Transfer
+from kcam.optics.source import Points
+from kcam.optics.wavelengths import few_wavelengths
+from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
+from kcam.planner.cross_spectra import rings
+from kcam.scene import Scene
+
+GROUPS, _BETWEEN_LINES = 7, 12  # wavelengths between whose line spreads those of all bands lie, for errors of up to so
+# many groups: such errors are 0.9 to 1.15 times those of each band's own (5 to 95 % of 36 deep scenes behind maps)
+_CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
+# and a round one: no slice knows its corners. Pixels scatter into all directions alike
+_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
+# slices tell of a PSF, and of a map of pixels, of which only some rows are looked at
+_AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
+_FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
+
+
+class Way(NamedTuple):
+    """How transfer functions are found. exactly: by PSFs or tables; else by line spreads, where there are any. few: of
+    wavelengths between some. cut: in a smaller window, by those of the whole.
+    """
+
+    exactly: bool = False
+    few: bool = False
+    cut: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Wavelengths, and their transfer functions; middle: of three distances, of which the one in the middle counts."""
+
+    wavelengths: list[float]
+    transfer: Transfer
+    middle: bool = False
+
+    def __call__(self, frequencies: Tensor, window: tuple[int, int], wavelengths: Tensor) -> Tensor:
+        """At frequencies (F,) and some of the wavelengths (L,), (Z, L, 2, F)."""
+        places = [self.wavelengths.index(one) for one in wavelengths.tolist()]
+        found = self.transfer(frequencies, window, places)
+        return found[1:2] if self.middle else found
+
+
+class Transfers:
+    """Those of a stage, and of others changed from it, before a batch of scenes.
+
+    picture: (H, W) of the wholes that the scenes are part of.
+    """
+
+    def __init__(self, imaging: Imaging, scene: Scene, picture: tuple[int, int]) -> None:
+        self.imaging, self.wavelengths, self.picture = imaging, scene.wavelengths, picture
+        self.deep, self.frequencies = is_deep(scene), rings()
+        self._like = imaging.working(scene)[:, :0]
+        vergences = (1 / torch.as_tensor(scene.depth, dtype=torch.float64)).flatten().cpu()
+        self._ends = torch.stack([vergences.min(), vergences.max()])  # the farthest and the nearest
+        self._stages: dict[Any, Imaging] = {}  # by changes
+        self._tabled: dict[Any, bool] = {}  # by propagator
+        self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
+        self._tables: dict[Any, Table | None] = {} if imaging.known is None else dict(imaging.known.others)
+        self._sliced: dict[Any, Tensor] = {}  # by table, window and wavelengths
+
+    def stage(self, changes: Mapping[str, Any]) -> Imaging:
+        """With changes: kept, because each setting is asked about often."""
+        key = tuple(sorted(changes.items()))
+        if key not in self._stages:
+            self._stages[key] = self.imaging.changed(**changes)
+        return self._stages[key]
+
+    @functools.cached_property
+    def few(self) -> Tensor:
+        """Wavelengths that tell of others."""
+        return self.imaging.changed(bands=FEW_BANDS).psf_wavelengths(self.wavelengths)
+
+    @functools.cached_property
+    def _every(self) -> Tensor:
+        """All wavelengths at which PSFs may stand for those of others."""
+        own, deep = self.wavelengths, self.deep
+        few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
+        few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
+        return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
+
+    @functools.cached_property
+    def _every_line(self) -> Tensor:
+        """The same, and those between whose line spreads others lie."""
+        if len(self.wavelengths) <= _BETWEEN_LINES or not self.deep:
+            return self._every
+        return torch.cat([self._every, few_wavelengths(self.wavelengths, _BETWEEN_LINES, interpolate=True)[0]])
+
+    def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
+        """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths
+        (L,), (L, G): of line spreads of a deep scene, of which each takes its time, those of all bands may lie between
+        some.
+        """
+        groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
+        shares = imaging.shares(wavelengths, deep=self.deep)
+        many = way.few and self.deep and not way.exactly and shares is None and len(groups) > _BETWEEN_LINES
+        if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
+            groups, shares = few_wavelengths(wavelengths, _BETWEEN_LINES, interpolate=True)
+        return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
+
+    def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
+        if not imaging.accuracy.blur:
+            return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
+        window = self.window(imaging, vergences)
+        known = self.table(imaging, vergences, wavelengths, grey=grey)
+        if known is None and not way.exactly:
+            known = self.lines(self._wider(imaging, vergences) if way.cut else imaging, vergences, wavelengths)
+        if known is None:
+            found = self._of_psfs(imaging, vergences, wavelengths, window)
+        else:
+            key = id(known), window, tuple(wavelengths.tolist())
+            if key not in self._sliced:
+                self._sliced[key] = known(self.frequencies, window, wavelengths).cpu()
+            found = self._sliced[key]
+        return found / found[..., :1] if imaging.accuracy.renormalise else found
+
+    def _wider(self, imaging: Imaging, vergences: Tensor) -> Imaging:
+        """The stage with the window of a whole PSF, if its own, which may be that of other distances, lies in it."""
+        whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape)
+        fits = all(map(operator.le, self.window(imaging, vergences), self.window(whole, vergences)))
+        return whole if fits else imaging
+
+    def _of_psfs(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
+        pixels = imaging.pixels(window, self._like)
+        bank = imaging.bank(Points(vergences), wavelengths, pixels)
+        slices = []
+        for dim in (-2, -1):
+            along = bank.sum(dim, dtype=torch.float64).cpu()
+            x = torch.arange(along.shape[-1], dtype=torch.float64) - along.shape[-1] // 2
+            slices.append(along.to(torch.complex128) @ torch.exp(-2j * math.pi * x[:, None] * self.frequencies))
+        return torch.stack(slices, dim=2)
+
+    def window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
+        """Of the PSFs of a stage [pixels]."""
+        return imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
+
+    @functools.cached_property
+    def fits(self) -> bool:
+        """Whether the window of a whole PSF cuts nothing but diffraction off."""
+        return self._widest is None or _inside(self._widest)
+
+    @functools.cached_property
+    def corners(self) -> float:
+        """Times the error along x and y that there is in the mean, at most."""
+        query = self._widest
+        if query is None or query.has_pixel_phase or self.fits:
+            return 1.0
+        return _CUT_ROUND if query.symmetric else _CUT
+
+    @functools.cached_property
+    def between_psfs(self) -> float:
+        """Times the error of PSFs that lie between others."""
+        return _BETWEEN_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _BETWEEN
+
+    @functools.cached_property
+    def _widest(self) -> Query | None:
+        """The scene's ends in a whole window."""
+        return self._query(self.imaging, self._ends, self.wavelengths, self.window(self.imaging, self._ends))
+
+    def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
+        if not isinstance(lens := imaging.lens, Lens):
+            return None
+        pixels = imaging.pixels(window, torch.empty(0, dtype=torch.float64))
+        return lens.question(Points(vergences), wavelengths, pixels, imaging.accuracy)
+
+    def table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, grey: bool = False) -> Table | None:
+        """Transfer functions of these wavelengths and others, where optics know them without PSFs.
+
+        Of many layers, and in grey light, a few wavelengths have a table, else all for which PSFs may stand. One layer
+        of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
+        """
+        one = self.deep and len(vergences) == 1
+        among = torch.cat([self._ends[:1], vergences.cpu(), self._ends[1:]]) if one else vergences
+        window, propagator = self.window(self.imaging, among), imaging.accuracy.propagator  # none is larger
+        if propagator not in self._tabled:
+            query = self._query(imaging, among, wavelengths, window)
+            # in the mean over directions a window that cuts rays off is not what it is; rings reach far with little
+            self._tabled[propagator] = (
+                query is not None
+                and imaging.accuracy.row(query).transfer_of is not None
+                and (self.fits or query.has_rings)
+            )
+        if not self._tabled[propagator]:
+            return None
+        few = grey or len(vergences) > _FEW_LAYERS
+        sets = [torch.cat([self._every, wavelengths]).unique()]
+        if set(wavelengths.tolist()) <= set(self.few.tolist()):
+            sets.append(self.few)
+        keys = [(propagator, window, tuple(vergences.tolist()), tuple(some.tolist())) for some in sets]
+        if (found := next((self._tables[key] for key in keys if key in self._tables), None)) is not None:
+            return found
+        some, key = (sets[-1], keys[-1]) if few else (sets[0], keys[0])
+        query = self._query(imaging, among, some, window)
+        transfer = None if query is None else imaging.accuracy.row(query).transfer(query)
+        if transfer is None:  # for more wavelengths another row is cheaper
+            self._tabled[propagator] = False
+            return None
+        self._tables[key] = found = Table(some.tolist(), transfer, middle=one)
+        if imaging.known is not None:
+            imaging.known.keep(key, found)
+        return found
+
+    def lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Table | None:
+        """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
+        window, some = self.window(imaging, vergences), torch.cat([self._every_line, wavelengths]).unique()
+        key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
+        if key not in self._tables:
+            query, like = self._query(imaging, vergences, some, window), key[1:3]
+            if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
+                self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self.few))
+            lines = None if query is None else self._line_rows[like].lines(query)
+            self._tables[key] = None if lines is None else Table(some.tolist(), lines)
+        return self._tables[key]
+
+
+def _inside(query: Query) -> bool:
+    """Whether all rays fall well inside the window."""
+    return float(query.displacement.max()) < (min(query.shape) // 2 - _AROUND) * query.pixel_pitch
