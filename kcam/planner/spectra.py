@@ -54,7 +54,9 @@ WINDOW = {"psf_shape", "renormalise"}
 
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
-_SEEN_THROUGH = 3.0  # the same where something near is blurred as wide as the picture, and what is behind it is not
+_SEEN_THROUGH = 3.0  # the same where something near is blurred wide, and what is behind it is not: little of that is
+# left, which stands for all that is hidden
+_WIDE = 1 / 8  # of the picture's shorter side, the radius of such a blur
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
 _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
@@ -297,7 +299,7 @@ class Spectra:
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
         far, near = (defocus.radius(end) - defocus.floor for end in ends)
-        wide = (near > min(self.optics.picture) / 2) & (far < near / 2)
+        wide = (near > _WIDE * min(self.optics.picture)) & (far < near / 2)
         return torch.where(wide, _SEEN_THROUGH, found)
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:

@@ -364,6 +364,28 @@ def test_windows_are_priced_in_grey_and_coloured_by_line_spreads(grey: float, fa
     assert ladder.error == pytest.approx(0.1 * factor)
 
 
+@pytest.mark.parametrize("seed", [n if n in (3, 7) else pytest.param(n, marks=pytest.mark.slow) for n in range(12)])
+def test_what_wavelengths_change_where_much_is_seen_through_little(seed: int) -> None:
+    """Stripes of another colour far behind others that are blurred wide: what is left of those behind stands for all
+    that is hidden of them, and so do its errors.
+    """
+    draw = Draw(seed)
+    lens = optics.Lens(optics.CircularAperture(draw.number(5, 8) * mm), optics.ThinLens(50 * mm), focus_distance=9.0)
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(5, 7) * um)
+    row = torch.arange(256)[:, None].expand(256, 192)
+    near = row % draw.whole(24, 64) < draw.number(0.6, 1.0) * torch.linspace(4, 60, 192)
+    colours = torch.rand(2, 3, generator=draw.generator)
+    light = torch.where(near, colours[0][:, None, None], colours[1][:, None, None])
+    depth = torch.where(near, draw.number(0.4, 0.5), draw.number(1.4, 1.8))[None, None]
+    scene = Scene.from_rgb(light * (0.6 + 0.4 * torch.rand(256, 192, generator=draw.generator)), depth=depth)
+    with torch.no_grad():
+        evaluator = Evaluator(Camera(imaging, sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB")), [scene])
+        evaluator.look({"bands": 2})
+        for count in (1, 2, 3):
+            trial = _error(evaluator.samples, evaluator.answers({"bands": count}), evaluator.answers({}))
+            assert evaluator.error({"bands": count}, {}) > 0.7 * trial
+
+
 def test_distances_may_have_windows_of_their_own() -> None:
     """That of one distance does not hold the rungs of another's."""
     plate = optics.ZernikeDOE(0.6 * torch.eye(8, dtype=torch.float64)[5])
