@@ -99,6 +99,7 @@ class Evaluator:
         self.scenes = full
         self.signals: list[dict[int, tuple[Tensor, Context]]] = []
         self.lost: dict[int, float] = {}  # see `_cut_off`
+        self._looked: Mapping[str, Any] = {}
         self.dimmed: list[float] = []  # of each signal, by blur, where it was looked at without: RMS over RMS
         self.spectra: list[Spectra] | None = None
         self._laid_out: dict[tuple[Any, ...], tuple[Tensor, Tensor, list[Place]]] = {}
@@ -134,6 +135,7 @@ class Evaluator:
         """See what the stages of the sensor are given, with about these optics or without blur, and whether spectra
         tell what choices cost: where the raw is linear in the light, but for what the full well cuts off.
         """
+        self._looked = settings
         few = {**settings, "bands": 1, "occlusion": False}  # it moves little of the light, and takes half of the time
         if "layers" in few and not any(bool(one.potential[BEYOND].any()) for one in self.items):
             few["layers"] = 1
@@ -233,7 +235,8 @@ class Evaluator:
         By spectra light beyond the full well counts too, so that they say at least as much.
         """
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
-            return _error(self.samples, self.answers(changes), self.answers(against))
+            sharp = self._dimming if changes.get("blur") is False is against.get("blur") else 1.0
+            return sharp * _error(self.samples, self.answers(changes), self.answers(against))
         if changes.get("occlusion") != against.get("occlusion"):
             return self._hidden(changes, against)
         found = [0.0]
@@ -241,11 +244,31 @@ class Evaluator:
             found += self._relative(sample, torch.stack(spectra.energies(changes, against, care)))
         return max(found)
 
+    @functools.cached_property
+    def _dimming(self) -> float:
+        """How many times as large an error of light without blur may be beside what blur leaves of it: of a few lights
+        whose error is in what lies around them. Trials that are tried together at last need not know.
+        """
+        told = {name: value for name, value in self._looked.items() if name in LINEAR}
+        return max((row for spectra in self.spectra or () for row in spectra.dimmed(told)), default=1.0)
+
+    @functools.cached_property
+    def hidden(self) -> list[float]:
+        """Of every item, RMS of the light that may be hidden, of what is recorded: all of it, of a few lights at
+        several distances, for masks of layers may be as steep as these are.
+        """
+        found = [one.hidden for one in self.items]
+        for sample, spectra in zip(self.samples, self.spectra or (), strict=False):
+            few = spectra.few_lights if spectra.optics.deep else torch.zeros(0)
+            for owner, alone in zip(sample.owners, few.tolist(), strict=False):
+                found[owner] = max(found[owner], float(alone))
+        return found
+
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
         """The error of what does not hide what it should, of the scenes with most light that may be hidden; at most
         that light where there is hardly any.
         """
-        hidden = [one.hidden for one in self.items]
+        hidden = self.hidden
         found, tried, pixels = [min(light, HARDLY) for light in hidden], set(), 0
         for owner in sorted({*self.lost}, key=hidden.__getitem__, reverse=True):
             if hidden[owner] >= HARDLY and pixels < LARGEST:

@@ -474,7 +474,7 @@ def _depth(view: _View) -> Iterator[Ladder]:
     yield layers
     if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
-        if view.one and any(one.hidden >= HARDLY for one in view.evaluator.items):
+        if view.one and any(light >= HARDLY for light in view.evaluator.hidden):
             levels = levels[1:]  # what would be saved is less than what it takes to find out
         yield Ladder("occlusion", levels, beside, follows=layers, settled=HIDING)
 

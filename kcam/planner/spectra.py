@@ -54,6 +54,7 @@ WINDOW = {"psf_shape", "renormalise"}
 
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
+_OVER_LIGHTS = 7.0  # times that of fewer layers: a light between two of them is seen through masks as steep as itself
 _SEEN_THROUGH = 3.0  # the same where something near is blurred wide, and what is behind it is not: little of that is
 # left, which stands for all that is hidden
 _WIDE = 1 / 8  # of the picture's shorter side, the radius of such a blur
@@ -246,7 +247,9 @@ class Spectra:
             hiding, even = self._masks._linear(changes, against, care)
             said = (_EDGES + drowned).clamp(max=1) * self.hidden * hiding / even.clamp(min=1e-300)
             return off + said * all_of_it, all_of_it
-        return self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
+        off, all_of_it = self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
+        laid_over = self._hides and changes.get("layers") != 1  # one plane hides nothing
+        return off * torch.where(self.few_lights & laid_over, _OVER_LIGHTS**2, 1.0), all_of_it
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
         """The same of some rows, and of what hides what: tried out."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 import torch
 from draws import Draw
 
-from benchmarks.planner import random_pair
+from benchmarks.planner import hard_pair, random_pair
 from kcam import Camera, Scene, optics, sensor
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
@@ -384,6 +385,36 @@ def test_what_wavelengths_change_where_much_is_seen_through_little(seed: int) ->
         for count in (1, 2, 3):
             trial = _error(evaluator.samples, evaluator.answers({"bands": count}), evaluator.answers({}))
             assert evaluator.error({"bands": count}, {}) > 0.7 * trial
+
+
+@pytest.mark.parametrize(("pair", "seed"), [(random_pair, 236), (hard_pair, 69)])
+def test_plans_hold_where_they_did_not(pair: Callable[[int], tuple[Camera, Scene, str, int]], seed: int) -> None:
+    """Pairs of the benchmark: lights on a ramp, by layers; and colours behind what is blurred wide, by wavelengths."""
+    camera, scene, *_ = pair(seed)
+    with torch.no_grad():
+        planner = Planner(camera, scene)
+        for tolerance in (0.003, 0.001):
+            assert planner.plan(tolerance).measure(camera, scene) <= tolerance
+
+
+@pytest.mark.parametrize("seed", [n if n in (0, 1) else pytest.param(n, marks=pytest.mark.slow) for n in range(12)])
+def test_plans_hold_for_lights_on_a_ramp(seed: int) -> None:
+    """Which are seen through the masks of the layers between which they lie: no spectrum of the light knows these."""
+    draw = Draw(seed)
+    focus, glass = 1 / draw.number(1.2, 1.8), optics.PlanoConvexLens(25.8 * mm, glass="N-BK7")
+    lens = optics.Lens(optics.CircularAperture(draw.number(1.5, 2.5) * mm), glass, focus_distance=focus)
+    camera = Camera(
+        optics.Imaging(lens, pixel_pitch=draw.number(3, 5) * um), sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB")
+    )
+    light = torch.full((28, 128, 64), 1e-3)
+    light += torch.rand(28, 1, 1, generator=draw.generator) * (torch.rand(128, 64, generator=draw.generator) > 0.997)
+    ramp = torch.linspace(draw.number(1.6, 2.0), draw.number(0.9, 1.2), 128, dtype=torch.float64)
+    scene = Scene.from_bands(light, wavelengths=wavelength_grid(), depth=(1 / ramp)[:, None].expand(1, 1, 128, 64))
+    with torch.no_grad():
+        planner = Planner(camera, scene)
+        for tolerance in (0.03, 0.01, 0.003, 0.001):
+            plan = planner.plan(tolerance)
+            assert plan.measure(camera, scene) <= tolerance, plan.changes
 
 
 def test_distances_may_have_windows_of_their_own() -> None:
