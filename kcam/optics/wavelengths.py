@@ -34,9 +34,9 @@ def chebyshev_wavelengths(wavelengths: Tensor, count: int) -> tuple[Tensor, Tens
 @functools.lru_cache(maxsize=256)
 def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple[np.ndarray, np.ndarray]:
     own = np.array(wavelengths)
-    shares = np.zeros((len(own), count))
     low, high = 1 / own.max(), 1 / own.min()
     if not interpolate or low == high:
+        shares = np.zeros((len(own), count))
         for index, group in enumerate(np.array_split((-own).argsort(kind="stable"), count)[::-1]):
             shares[group, index] = 1
         means = own @ shares / shares.sum(0)

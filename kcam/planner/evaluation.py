@@ -259,9 +259,9 @@ class Evaluator:
         """
         found = [one.hidden for one in self.items]
         for sample, spectra in zip(self.samples, self.spectra or (), strict=False):
-            few = spectra.few_lights if spectra.optics.deep else torch.zeros(0)
-            for owner, alone in zip(sample.owners, few.tolist(), strict=False):
-                found[owner] = max(found[owner], float(alone))
+            for owner, few in zip(sample.owners, spectra.few_lights.tolist(), strict=True):
+                if few and spectra.optics.deep:
+                    found[owner] = max(found[owner], 1.0)
         return found
 
     def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:

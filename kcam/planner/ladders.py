@@ -6,6 +6,7 @@ To add a choice, write a function that gives its ladder, and a row of `LADDERS`.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -61,8 +62,6 @@ LITTLE = 1 / 2
 
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
-
-ROUGH = Care.ROUGH, Care.AT_FIRST
 
 EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
 """Models. What other choices cost is the same in both, to 10 % (of 24 maps of pixels, f/5 to f/50)."""
@@ -128,7 +127,7 @@ class Ladder:
     urgency: float = 1.0
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
-    roughly: dict[Care, dict[tuple[int, int], float]] = field(default_factory=lambda: {care: {} for care in ROUGH})
+    roughly: dict[Care, dict[tuple[int, int], float]] = field(default_factory=lambda: defaultdict(dict))
     grey: dict[tuple[int, int], float] = field(default_factory=dict)
     compared: set[tuple[int, int]] = field(default_factory=set)
 

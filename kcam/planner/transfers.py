@@ -24,8 +24,9 @@ from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
 
-GROUPS, _BETWEEN_LINES = 7, 12  # wavelengths between whose line spreads those of all bands lie, for errors of up to so
-# many groups: such errors are 0.9 to 1.15 times those of each band's own (5 to 95 % of 36 deep scenes behind maps)
+_BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
+GROUPS = 7  # of bands, up to which errors are told so: 0.9 to 1.15 times what they are by each band's own line spread
+# (5 to 95 % of 36 deep scenes behind maps)
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
@@ -87,7 +88,7 @@ class Transfers:
     @functools.cached_property
     def few(self) -> Tensor:
         """Wavelengths that tell of others."""
-        return self.imaging.changed(bands=FEW_BANDS).psf_wavelengths(self.wavelengths)
+        return self.stage({"bands": FEW_BANDS}).psf_wavelengths(self.wavelengths)
 
     @functools.cached_property
     def _every(self) -> Tensor:
