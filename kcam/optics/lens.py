@@ -17,7 +17,7 @@ from kcam.optics.elements.stack import ElementStack
 from kcam.optics.numerics import float64
 from kcam.optics.propagation.analysis import encircled_energy, mtf
 from kcam.optics.propagation.explanation import Explanation, explain_query
-from kcam.optics.propagation.grid import samples_by_rule
+from kcam.optics.propagation.grid import sample_counts
 from kcam.optics.propagation.off_axis import relative_illumination
 from kcam.optics.propagation.question import Query, Sampling, residual_vergence
 from kcam.optics.propagation.sampling import KAPPA, MAX_PUPIL_SAMPLES
@@ -286,7 +286,7 @@ class Lens(ElementStack):
         found = {row.kind: row.cost(query) * pixels.dtype.itemsize / 4}
         if self.has_pixel_phase:
             maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
-            counts = [samples_by_rule(query, index) for index in range(len(query.wavelengths))]
+            counts = sample_counts(query)
             tau = float(query.tau.detach())
             warps = (0.0 if row.paraxial else warp_terms(count, tau) * count**2 for count in counts)
             found["map"] = sum(maps + warp for warp in warps)

@@ -25,16 +25,16 @@ from kcam.units import mm, um
 
 RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.values()} | {
     "map": 1.2e-08,
-    "bank": 7e-3,
-    "psf": 5e-4,
+    "bank": 6e-3,
+    "psf": 3.5e-4,
     "field": 8e-2,
     "field psf": 2e-3,
     "field point": 1.5e-7,
-    "transform": 9e-11,
-    "product": 8e-11,
+    "transform": 1.5e-10,
+    "product": 3e-10,
     "touch": 6e-10,
     "large": 1.6e-8,
-    "layer": 1e-5,
+    "layer": 8e-4,
 }
 """Kind of work -> seconds for one operation, on the machine where the defaults were measured (one core, float32).
 

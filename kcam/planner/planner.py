@@ -28,7 +28,7 @@ from kcam.threads import no_more_than_free
 
 WORTH, WORTH_DEEP = 0.2, 0.4
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and with a
-map of depth; each picture of a batch adds a sixteenth: measured.
+map of depth; each picture of a batch adds an eighth: measured.
 """
 
 SENSOR = "sensor"
@@ -134,7 +134,7 @@ class Planner:
             return False
         scene = self.prices.scene
         worth = WORTH_DEEP if is_deep(scene) else WORTH
-        return self.prices.of({})[0] > worth * (1 + scene.shape[0] / 16)
+        return self.prices.of({})[0] > worth * (1 + scene.shape[0] / 8)
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:

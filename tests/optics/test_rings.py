@@ -19,7 +19,7 @@ from kcam.optics.numerics import BesselJ0 as _BesselJ0
 from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.radial import hankel
-from kcam.optics.propagation.rings import panels_of
+from kcam.optics.propagation.rings import fewer_nodes, panels_of
 from kcam.optics.propagation.spectrum import spectrum_grids
 from kcam.optics.pupil.coordinates import Pupil
 from kcam.units import mm, nm, um
@@ -371,6 +371,40 @@ def test_panels_close_in_on_a_step() -> None:
     assert torch.equal(edges[[0, -1]], torch.tensor([0.0, 1.0], dtype=torch.float64))
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_fewer_nodes_tell_a_kernel_as_much(seed: int) -> None:
+    """Of a rough field, at random frequencies up to that of the kernel, of one part of the radius and of many."""
+    rng, generator = random.Random(seed), torch.Generator().manual_seed(seed)
+    frequency, inner = log_uniform(rng, 30, 5000), rng.choice([0.0, rng.uniform(0, 0.8)])
+    nodes = inner + (1 - inner) * torch.rand(int(4 * frequency) + 200, generator=generator, dtype=torch.float64)
+    values = torch.randn(2, len(nodes), generator=generator, dtype=torch.float64) / len(nodes)
+    fewer, places = fewer_nodes(values, nodes, frequency=frequency)
+    assert len(places) < 0.7 * len(nodes)
+    t = frequency * torch.rand(50, 1, generator=generator, dtype=torch.float64)
+    truth, found = ((v @ torch.cos(t * x).T) for v, x in ((values, nodes), (fewer, places)))
+    assert float((found - truth).abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_window_cuts_a_psf_and_changes_nothing_else(seed: int) -> None:
+    """Wherever the table of the light ends: of random windows, pitches and lenses, in and out of focus."""
+    rng = random.Random(seed)
+    lens = optics.Lens(
+        optics.CircularAperture(rng.uniform(1, 6) * mm), optics.ThinLens(25 * mm), focus_distance=rng.uniform(0.5, 3)
+    )
+    shape = rng.randint(1, 40), rng.randint(1, 40)
+    wide = tuple(n + 2 * rng.randint(1, 30) for n in shape)
+    asked = {
+        "distances": rng.uniform(0.5, 3), "pixel_pitch": rng.uniform(1, 6) * um, "method": "radial",
+        "fill_factor": rng.choice([1.0, 0.5]), "integrate": rng.random() < 0.7, "dtype": torch.float64,
+    }  # fmt: skip
+    wavelengths = [rng.uniform(400, 700) * nm for _ in range(2)]
+    small, large = (lens.psf(wavelengths, shape=own, **asked) for own in (shape, wide))
+    top, left = (b // 2 - a // 2 for a, b in zip(shape, wide, strict=True))
+    part = large[..., top : top + shape[0], left : left + shape[1]]
+    torch.testing.assert_close(small, part, rtol=0, atol=5e-6 * float(large.max()))
+
+
 @pytest.mark.parametrize("steps", [1, 17, 100, 1000])
 def test_the_refined_table_is_that_of_each_step(steps: int) -> None:
     """Of random rings, the outermost among them: it has the highest frequency."""
@@ -379,8 +413,8 @@ def test_the_refined_table_is_that_of_each_step(steps: int) -> None:
     field = torch.randn(3, 50, generator=generator, dtype=torch.float64)
     t = torch.arange(steps, dtype=torch.float64) * math.pi / 12
     direct = 2 * math.pi * field @ torch.as_tensor(j0((t[:, None] * rho).numpy())).T
-    assert hankel(field, steps, rho).shape == direct.shape
-    assert float((hankel(field, steps, rho) - direct).abs().max()) < 1e-8 * float(field.abs().sum())
+    assert hankel(field, steps, rho, finer=6).shape == direct.shape
+    assert float((hankel(field, steps, rho, finer=6) - direct).abs().max()) < 1e-8 * float(field.abs().sum())
 
 
 # ---- second derivatives --------------------------------------------------------------------------------------------

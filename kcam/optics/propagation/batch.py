@@ -272,7 +272,7 @@ def _amplitude(rim: Tensor, *, nodes: int, arguments: int) -> Tensor:
     rho, weights = (torch.as_tensor(value, device=rim.device) for value in legendre(nodes))
     rho = (rho + 1) / 2
     phase = rim[..., None] * rho**2
-    field = torch.stack([phase.cos(), phase.sin()]) * (rho * weights / (2 * math.pi))
+    field = torch.stack([phase.cos(), phase.sin()]) * (rho * weights)
     return field @ hankel_kernel(rho, arguments, step=_STEP)
 
 

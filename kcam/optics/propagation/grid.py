@@ -60,13 +60,21 @@ def sample_counts(query: Query) -> list[int]:
 
 
 def _geometry(query: Query, index: int) -> dict[str, float]:
-    return {
-        "semi_aperture": query.scale[0],
-        "sensor_distance": query.scale[1],
-        "wavelength": float(query.wavelengths[index]),
-        "half_window": query.half_window,
-        "displacement": float(query.displacement[index]),
-    }
+    key = f"geometry, {query.paraxial}"
+    if key not in query.kept:  # a number at a time costs more than all that is done with it
+        (a, d), half_window = query.scale, query.half_window
+        query.kept[key] = [
+            {
+                "semi_aperture": a,
+                "sensor_distance": d,
+                "wavelength": wavelength,
+                "half_window": half_window,
+                "displacement": displacement,
+            }
+            for wavelength, displacement in zip(query.wavelengths.tolist(), query.displacement.tolist(), strict=True)
+        ]
+    found: dict[str, float] = query.kept[key][index]
+    return found
 
 
 def _checked_samples(query: Query, index: int) -> int:

@@ -21,8 +21,9 @@ from kcam.optics.propagation.row import Propagator, Rate
 from kcam.optics.pupil.coordinates import Pupil, from_image_side
 from kcam.optics.pupil.rim import kaiser_sinc
 
-_TABLE_STEP = math.pi / 12  # of the Hankel table; eight-point interpolation is then good to 2e-8
-_FINER = 6  # steps between those that are summed up: a disc of radius 1 has no frequency above 1
+_SUMMED = math.pi / 2  # step of t at which the pupil is summed up: a disc of radius 1 has no frequency above 1
+_LIGHT_FINER = 12  # as finely |U|^2 is tabulated; eight-point interpolation is then good to 2e-8
+_EVEN_FINER = 2  # as finely in the sum over the light: half of the largest step that tells its frequencies
 _SINC_TAPS, _SINC_BETA = 12, 18.0  # on either side, and Kaiser's window: the steps between are then good to 4e-9
 _REFINED_AT_ONCE = 16
 _MOST_RINGS = 2**20
@@ -34,11 +35,10 @@ _EVEN = 128  # steps by which tables grow, so that a lens that is focused anew f
 _FEWEST, _PER_FRINGE = 256, 2  # frequencies in a table of transfer functions, in all and for each fringe
 _BEYOND_RAYS = 80.0  # times what the rim diffracts beyond all, for transfer functions
 _TAIL = 64  # rings of what it diffracts farther
-_CUBIC = range(-1, 3)
-_EVERY = 3  # step of the Hankel table in the sum over the light: half of the largest that tells its frequencies
+_CUBIC, _EIGHT = range(-1, 3), range(-3, 5)  # points on both sides of a value between them
 _NEAR_0 = (0.0947421, -0.0124339, 0.0010251)
 """Of f(t) t at 0, h and 2 h, beside the trapezium rule's weights: what Euler and Maclaurin add to it, to h^8."""
-LOOKUPS = Rate("radial", 1.5e-10)
+LOOKUPS = Rate("radial", 1e-10)
 """Of operations of which most look numbers up."""
 
 
@@ -46,31 +46,29 @@ def radial_psf(query: Query) -> Tensor:
     """PSFs of a rotationally symmetric pupil by one Hankel transform, U(t) = 2 pi INT A exp(ikW) J0(t rho) rho d rho.
 
     Gauss-Legendre nodes from rim to rim, so that the edge is exact; J0 is tabulated over t = k a' r / d, in which all
-    wavelengths and distances share one table, and U is interpolated onto the pixels' radii by eight points.
+    wavelengths and distances share one table, and |U|^2 is interpolated onto the pixels' radii by eight points.
     """
     wavelengths = query.wavelengths.to(query.device)
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
-    transformed, energy = _transformed(query, scales, _corner(query))
+    farthest = max(math.hypot(*reaches) / n for n, reaches in (_reaches(query, w) for w in query.wavelengths.tolist()))
+    light, energy = _light(query, scales, farthest * query.pixel_pitch, finer=_LIGHT_FINER)
+    light = torch.cat([light[..., 1 : -_EIGHT.start + 1].flip(-1), light], dim=-1).to(query.dtype)
     bands = []
     for index, wavelength in enumerate(query.wavelengths.tolist()):
-        arguments = (transformed[:, index], scales[index], query, wavelength)
+        arguments = (light[index], scales[index], query, wavelength)
         image = (
             checkpoint(_ring_image, *arguments, use_reentrant=False)
-            if transformed.requires_grad
-            else (_ring_image(*arguments))
+            if light.requires_grad
+            else _ring_image(*arguments)
         )
         factor = (a * query.pixel_pitch / (wavelengths[index] * d)) ** 2 / energy
         bands.append(image * factor[:, None, None].to(query.dtype))
     return torch.stack(bands, dim=1)
 
 
-def _corner(query: Query) -> float:
-    return math.hypot(*query.half_sides) * query.pixel_pitch
-
-
-def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """U at t = 0, `_TABLE_STEP`, ... as far as a reach [m], (2, L, Z, T); the energy that passes, (1 or Z,).
+def _light(query: Query, scales: Tensor, reach: float, *, finer: int) -> tuple[Tensor, Tensor]:
+    """|U|^2 at t = 0, `_SUMMED` / finer, ... as far as a reach [m], (L, Z, T); the energy that passes, (1 or Z,).
 
     Args: scales: (L,) t per metre on the sensor.
     """
@@ -84,13 +82,14 @@ def _transformed(query: Query, scales: Tensor, reach: float) -> tuple[Tensor, Te
     amplitude, energy = ring_amplitude(query, pupil, rho * weights)
     field = torch.stack([phase.cos(), phase.sin()]) * amplitude  # (2, L, Z, n)
     field, rho = fewer_nodes(field, rho, frequency=largest)
-    steps = math.ceil(largest / _TABLE_STEP) + 8
-    length = max(1, _FINER * _RINGS_AT_ONCE // steps)
+    steps = math.ceil(largest * finer / _SUMMED) + len(_EIGHT)
+    length = max(1, finer * _RINGS_AT_ONCE // steps)
     parts = list(zip(*(part.split(length, dim=-1) for part in (field, rho)), strict=True))
     if len(parts) == 1:
-        return hankel(field, steps, rho), energy
+        return hankel(field, steps, rho, finer=finer).square().sum(0), energy
     # the table of each part is built again in the backward pass, not kept
-    return torch.stack([checkpoint(hankel, f, steps, r, use_reentrant=False) for f, r in parts]).sum(0), energy
+    transformed = [checkpoint(hankel, f, steps, r, finer=finer, use_reentrant=False) for f, r in parts]
+    return torch.stack(transformed).sum(0).square().sum(0), energy
 
 
 @dataclass(frozen=True)
@@ -102,8 +101,8 @@ class RadialTransfer:
     of what falls into a window in the mean over directions, times that of a pixel, folded at the pixels' frequency.
     Well beyond its rays light is diffracted at the rim alone: T / r of it falls outside a radius r, see `Lens.window`.
 
-    Args:      light: |U|^2 t dt / (4 pi^2 E) at even t, (L, Z, T), with Euler and Maclaurin's corrections near 0.
-               kernel: 2 pi J0(kappa t) at even kappa up to 2, (T, K).
+    Args:      light: |U|^2 t dt / (2 pi E) at even t, (L, Z, T), with Euler and Maclaurin's corrections near 0.
+               kernel: J0(kappa t) at even kappa up to 2, (T, K).
                step: of t [pixels], (L,). kappa: entries of the kernel for each cycle per pixel, (L,).
                rim: T [pixels], (L,).
                active: width of the light-sensitive part of a pixel; None where no pixel is integrated over.
@@ -137,14 +136,15 @@ class RadialTransfer:
     def _beyond(self, frequencies: Tensor, shape: tuple[int, int], chosen: Tensor) -> Tensor:
         """Of the light in a window beyond the table, INT share(r) J0(2 pi f r) T dr / r^2, (L, F)."""
         reach = (self.light.shape[-1] - 0.5) * self.step[chosen, None]  # the last step goes half as far again
-        corner = torch.clamp(reach, min=math.hypot(*shape) / 2)
-        if not bool((corner > reach).any()):
+        nearest, corner = float(reach.detach().min()), math.hypot(*shape) / 2
+        if nearest >= corner:
             return torch.zeros((), dtype=torch.float64, device=reach.device)[None]
-        share = (torch.arange(_TAIL, dtype=torch.float64, device=reach.device) + 0.5) / _TAIL
-        radius = 1 / (1 / reach + (1 / corner - 1 / reach) * share)  # (L, R)
-        rings = BesselJ0.apply(2 * math.pi * frequencies * radius[..., None])
-        tail = (_share_inside(shape, radius)[..., None] * rings).mean(1)
-        return tail * self.rim[chosen, None] * (1 / reach - 1 / corner)
+        # even steps of 1 / r, of which each wavelength takes those beyond its own reach
+        steps = torch.linspace(1 / corner, 1 / nearest, _TAIL + 1, dtype=torch.float64, device=reach.device)
+        radius = 2 / (steps[1:] + steps[:-1])
+        rings = BesselJ0.apply(2 * math.pi * frequencies[:, None] * radius)
+        width = torch.minimum((1 / reach - steps[:-1]).clamp(min=0), steps.diff())  # (L, R)
+        return (width * _share_inside(shape, radius)) @ rings.T * self.rim[chosen, None]
 
 
 def radial_transfer(query: Query) -> RadialTransfer:
@@ -153,17 +153,17 @@ def radial_transfer(query: Query) -> RadialTransfer:
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
     rim = wavelengths * d / (2 * math.pi**2) * query.lens.rim_per_area()
-    reach = min(_corner(query), float(query.displacement.max()) + float(_BEYOND_RAYS * rim.detach().max()))
-    transformed, energy = _transformed(query, scales, reach)
-    intensity = transformed[..., ::_EVERY].square().sum(0)  # (L, Z, T)
-    step = _EVERY * _TABLE_STEP
+    corner = math.hypot(*query.half_sides) * query.pixel_pitch
+    reach = min(corner, float(query.displacement.max()) + float(_BEYOND_RAYS * rim.detach().max()))
+    intensity, energy = _light(query, scales, reach, finer=_EVEN_FINER)
+    step = _SUMMED / _EVEN_FINER
     t = torch.arange(intensity.shape[-1], dtype=torch.float64, device=query.device) * step
     weights = t * step
     weights[: len(_NEAR_0)] += step**2 * torch.tensor(_NEAR_0, dtype=torch.float64, device=query.device)
     light = intensity * weights
     count = max(_FEWEST, math.ceil(_PER_FRINGE * 2 * float(t[-1]) / math.pi))
     return RadialTransfer(
-        light=light / (4 * math.pi**2 * energy[:, None]),
+        light=light / (2 * math.pi * energy[:, None]),
         kernel=hankel_kernel(t, count, step=2 / (count - 1)),
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
@@ -190,14 +190,14 @@ def even_between(values: Tensor, position: Tensor) -> Tensor:
 
 
 def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
-    """2 pi J0(t rho) at t = 0, step, ..., (n, steps): what a field over rings (..., n) is multiplied with.
+    """J0(t rho) at t = 0, step, ..., (n, steps): what a field over rings (..., n) is multiplied with.
 
     A table that is not large is kept for others with the same rings: most of the time of one PSF goes into it.
     """
 
     def build(count: int) -> Tensor:
         t = torch.arange(count, dtype=torch.float64, device=rho.device) * step
-        return 2 * math.pi * BesselJ0.apply(t[:, None] * rho).T
+        return BesselJ0.apply(rho[:, None] * t)
 
     count = _EVEN * math.ceil(steps / _EVEN)
     if rho.numel() * count > KEPT:
@@ -205,18 +205,18 @@ def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
     return _KERNELS.get((rho, count, step), lambda: build(count))[:, :steps]
 
 
-def hankel(field: Tensor, steps: int, rho: Tensor) -> Tensor:
-    """2 pi sum_n field_n J0(t rho_n) of a field over rings (..., n) at t = 0, `_TABLE_STEP`, ..., (..., steps)."""
-    coarse = math.ceil(steps / _FINER) + _SINC_TAPS
-    return _refined(field @ hankel_kernel(rho, coarse, step=_FINER * _TABLE_STEP))[..., :steps]
+def hankel(field: Tensor, steps: int, rho: Tensor, *, finer: int) -> Tensor:
+    """2 pi sum_n field_n J0(t rho_n) of a field over rings (..., n) at t = 0, `_SUMMED` / finer, ..., (..., steps)."""
+    coarse = math.ceil(steps / finer) + _SINC_TAPS
+    return _refined(2 * math.pi * field @ hankel_kernel(rho, coarse, step=_SUMMED), finer)[..., :steps]
 
 
-def _refined(values: Tensor) -> Tensor:
-    """An even function without frequencies above pi / 2 that is known at 0, 1, ... (..., C), `_FINER` times as finely,
+def _refined(values: Tensor, finer: int) -> Tensor:
+    """An even function without frequencies above pi / 2 that is known at 0, 1, ... (..., C), so many times as finely,
     but for the last `_SINC_TAPS`.
     """
     mirrored = torch.cat([values[..., 1:_SINC_TAPS].flip(-1), values], dim=-1)
-    weights = _sinc_weights().to(values.device)
+    weights = _sinc_weights(finer).to(values.device)
     missing = -(mirrored.shape[-1] - 2 * _SINC_TAPS + 1) % _REFINED_AT_ONCE
     blocks = torch.nn.functional.pad(mirrored, (0, missing)).unfold(-1, len(weights), _REFINED_AT_ONCE)
     return (blocks @ weights).flatten(-2)
@@ -224,9 +224,9 @@ def _refined(values: Tensor) -> Tensor:
 
 @functools.cache
 @torch.inference_mode(False)
-def _sinc_weights() -> Tensor:
+def _sinc_weights(finer: int) -> Tensor:
     """What each of so many neighbours gives to `_REFINED_AT_ONCE` steps and those between them."""
-    between = np.arange(_REFINED_AT_ONCE * _FINER) / _FINER
+    between = np.arange(_REFINED_AT_ONCE * finer) / finer
     off = between - np.arange(1 - _SINC_TAPS, _REFINED_AT_ONCE + _SINC_TAPS)[:, None]
     return torch.as_tensor(kaiser_sinc(off, half_width=_SINC_TAPS, beta=_SINC_BETA))
 
@@ -262,17 +262,16 @@ def ring_amplitude(query: Query, pupil: Pupil, quadrature: Tensor) -> tuple[Tens
     return amplitude, 2 * math.pi * energy.sum(-1)
 
 
-def _ring_image(transformed: Tensor, scale: Tensor, query: Query, wavelength: float) -> Tensor:
-    """Intensity on the pixels from the tabulated transform (2, Z, T) of one wavelength."""
+def _ring_image(light: Tensor, scale: Tensor, query: Query, wavelength: float) -> Tensor:
+    """Intensity on the pixels from that of one wavelength at even t from `_EIGHT.start` steps before 0 on, (Z, T)."""
     per_pixel, reaches = _reaches(query, wavelength)
     radii2, inverse = _lattice(*reaches, query.device)
-    position = scale * torch.sqrt(radii2) * (query.pixel_pitch / per_pixel) / _TABLE_STEP
-    low = torch.clamp(position.detach().floor().long() - 3, max=transformed.shape[-1] - 8)
-    offset = position - low
-    value = torch.zeros_like(transformed[..., low])
-    for tap, weight in enumerate(lagrange(offset, taps=range(8))):
-        value = value + weight * transformed[..., torch.abs(low + tap)]  # U is even in t
-    intensity = value.square().sum(0).to(query.dtype)  # (Z, radii)
+    position = scale * torch.sqrt(radii2) * (query.pixel_pitch * _LIGHT_FINER / (per_pixel * _SUMMED))
+    low = position.detach().long()
+    weights = torch.stack(lagrange((position - low).to(query.dtype), taps=_EIGHT))
+    # eight neighbours lie side by side: one look for all, and a distance at a time fits the processor's memory
+    found = [(row.unfold(-1, len(_EIGHT), 1)[low].mT * weights).sum(0) for row in light]
+    intensity = torch.stack(found).clamp(min=0)  # (Z, radii); in dark rings eight points may leave less than nothing
     return query.pixels(per_pixel).of_quadrant(intensity[:, inverse].unflatten(-1, [reach + 1 for reach in reaches]))
 
 
@@ -299,9 +298,9 @@ def _error(query: Query) -> float:
 
 
 def lookup_cost(query: Query) -> float:
-    """Operations of 40 for each point at which the intensity is evaluated."""
+    """Operations of 40 for each point at which the intensity is evaluated, and for its weights."""
     points = (math.prod(2 * reach + 1 for reach in _reaches(query, w)[1]) for w in query.wavelengths.tolist())
-    return query.vergences.numel() * 40.0 * sum(points)
+    return (query.vergences.numel() + 1) * 40.0 * sum(points)
 
 
 def _needs_symmetry(query: Query) -> str | None:

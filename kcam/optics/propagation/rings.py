@@ -15,7 +15,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import MOST_NODES, legendre, phasor
+from kcam.optics.numerics import legendre, phasor
 
 _MOST_PANELS = 2**14
 _FINEST = 2.0**-26  # width of a panel around a step that no panel resolves: of no weight any more
@@ -24,6 +24,7 @@ _CHECKED = 16  # nodes by which a panel is judged
 _LOOKED_AT = 2**16  # places along the radius at which narrow structure is looked for
 _BEND = 1e-3  # between three of these: what is bent more, nodes of a wide panel may not see [rad]
 _MOST_SPECTRUM = 2**17  # samples of a radius
+_TURNS = 200  # of a kernel, that the polynomials of one part of the radius follow
 
 
 def panels_of(phase: Callable[[Tensor], Tensor], knots: Tensor, *, first: int = 32) -> Tensor:
@@ -102,16 +103,24 @@ def fewer_nodes(values: Tensor, nodes: Tensor, *, frequency: float) -> tuple[Ten
     Returns:   values (..., m) and nodes (m,); as they were where m is no less.
     """
     low = float(nodes.detach().min())
-    turns = frequency * (1 - low) / 2
+    parts = max(1, math.ceil(frequency * (1 - low) / 2 / _TURNS))
+    turns = frequency * (1 - low) / 2 / parts
     count = math.ceil(turns + min(48, 12 + 8 * turns ** (1 / 3)))
-    if 1.5 * count > nodes.numel() or count > MOST_NODES or nodes.requires_grad:
+    if 1.5 * count * parts > nodes.numel() or nodes.requires_grad:
         return values, nodes
+    inside = (nodes - low) * (parts / (1 - low))
+    part = inside.long().clamp(max=parts - 1)
     places, weights = legendre(count)
-    inside = (2 * nodes - 1 - low) / (1 - low)
-    fine, coarse = (np.polynomial.legendre.legvander(x, count - 1) for x in (inside.cpu().numpy(), places))
-    back = coarse.T * weights * (np.arange(count)[:, None] + 0.5)
-    projected = values @ torch.as_tensor(np.ascontiguousarray(fine)).to(nodes) @ torch.as_tensor(back).to(nodes)
-    return projected, low + (1 - low) * (torch.as_tensor(places).to(nodes) + 1) / 2
+    coarse = np.polynomial.legendre.legvander(places, count - 1)
+    back = torch.as_tensor(coarse.T * weights * (np.arange(count)[:, None] + 0.5)).to(nodes)
+    projected = []
+    for own in range(parts):
+        chosen = (part == own).nonzero()[:, 0]
+        fine = np.polynomial.legendre.legvander((2 * (inside[chosen] - own) - 1).cpu().numpy(), count - 1)
+        projected.append(values[..., chosen] @ torch.as_tensor(np.ascontiguousarray(fine)).to(nodes) @ back)
+    ends = torch.arange(parts, dtype=nodes.dtype, device=nodes.device)[:, None]
+    fewer = (torch.as_tensor(places).to(nodes) + 1) / 2 + ends
+    return torch.cat(projected, dim=-1), low + (1 - low) / parts * fewer.flatten()
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ class Rate(NamedTuple):
     seconds: float
 
 
-PRODUCTS = Rate("matrix", 4e-11)
+PRODUCTS = Rate("matrix", 5e-11)
 """Of operations as in a product of matrices."""
 FFT_SLOWNESS = 10.0  # operations of a matrix product in the time of one of an FFT, measured on a CPU in float32
 
