@@ -2,8 +2,7 @@
 
 By spectra where the raw is linear in the light, see `spectra`: then no picture is rendered, and the choices of a plan
 add up. Else a choice is tried out: inside the camera's own borders, mosaic, layers and full well. It is cheap because
-it is tried beside others that are cheap: few wavelengths, few layers of depth. Where follows from a `survey`: the items
-and tiles where a choice could hurt most, and what share of the picture they stand for.
+it is tried beside others that are cheap, few wavelengths and few layers of depth, and on `samples` of the scenes.
 
 What trials of one choice tell little of another's ends with a last trial, of the whole plan against the reference, on
 all that was planned for, or on the worst `WITNESSED` pixels of it.
@@ -14,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -27,9 +26,9 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.rendering.place import Place
 from kcam.optics.source import Defocus
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
-from kcam.planner.range import COLOUR, DEPTH, OTHER_LIGHT, shares
+from kcam.planner.samples import Sample, samples_of
 from kcam.planner.spectra import LINEAR, Care, Spectra, linear
-from kcam.planner.survey import BEYOND, CLIPPING, KINDS, TILE, Survey, survey
+from kcam.planner.survey import BEYOND, CLIPPING, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, Mosaic, Transmission
 from kcam.sensor.random_stage import RandomStage
@@ -42,28 +41,6 @@ CUT = 1.01  # RMS of light over that of what the full well leaves of it, from wh
 LOOKED = 129  # side of the PSFs with which the light is looked at, where these hold most of it: wide ones take long
 UNLIKE = 1.1  # of sharp light, in energy, up to which what pixels see of colours is as in blurred light
 HARDLY = 3e-3  # RMS of light that may be hidden, of what is recorded, that is taken for what it changes at most
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Scenes to try choices on, or crops of them, as one batch: of the nearest and the farthest point too, so that
-    layers of depth lie where they lie in the whole.
-
-    owners: whose each row is. places: of optics that vary over the picture, where the middle of each row lies from that
-    of its `picture` (H, W), x and y, upright [pixels]; None where they are whole. factors: on their relative
-    errors, for the part of a scene that its crops stand for.
-    """
-
-    scene: Scene
-    owners: tuple[int, ...]
-    factors: tuple[float, ...]
-    places: tuple[tuple[float, float], ...] | None = None
-    picture: tuple[int, int] = (0, 0)
-
-    def of_owners(self) -> list[tuple[list[int], float]]:
-        """The rows of each whole, and the factor on their error."""
-        wholes = dict(zip(self.owners, self.factors, strict=True))
-        return [([row for row, own in enumerate(self.owners) if own == whole], f) for whole, f in wholes.items()]
 
 
 @dataclass(frozen=True)
@@ -124,12 +101,12 @@ class Evaluator:
         # over the field a whole picture takes fewer PSFs than its crops: places mirror each other
         if self.whole:
             return self.witnesses
-        return _samples(self.scenes, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
+        return samples_of(self.scenes, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
 
     @functools.cached_property
     def witnesses(self) -> list[Sample]:
         """What a finished plan is tried on."""
-        return _samples(self.scenes, self.surveys, pixels=2**62 if self.whole else WITNESSED)
+        return samples_of(self.scenes, self.surveys, pixels=2**62 if self.whole else WITNESSED)
 
     def look(self, settings: Mapping[str, Any]) -> None:
         """See what the stages of the sensor are given, with about these optics or without blur, and whether spectra
@@ -427,96 +404,3 @@ def _error(samples: Sequence[Sample], ours: Sequence[Answer], theirs: Sequence[A
                 found.append(factor * relative_rms(one.raw[rows], other.raw[rows]))
         found += [relative_rms(a, b) for a, b in zip(one.gradients, other.gradients, strict=True) if bool(b.any())]
     return max(found)
-
-
-def _samples(
-    scenes: Sequence[Scene], surveys: Sequence[Sequence[Survey]], *, pixels: int, side: int | None = None
-) -> list[Sample]:
-    """What choices are tried on: all that there is while it has not more than so many pixels; else the scenes with the
-    largest potential of each kind, relative to what is recorded of them, those of light or distances that none of
-    these has, for potentials do not tell how wrong a choice is at one wavelength or distance, and others as they come
-    closest to the first.
-
-    side: of the crops that are made of a single scene with more than so many pixels; None: so that they have as many.
-    """
-    every = [(index, row) for index, found in enumerate(surveys) for row in range(len(found))]
-    if not every:
-        return []
-    relative = torch.stack([surveys[index][row].relative() for index, row in every])
-    score = (relative / relative.amax(0).clamp(min=1e-30)).amax(1)
-    sizes = [scenes[index].shape[1] * scenes[index].shape[2] for index, _ in every]
-    chosen = list(dict.fromkeys(relative.argmax(0).tolist()))
-    for kind, least in (("light", COLOUR), ("depths", DEPTH)):
-        own = shares(torch.stack([getattr(surveys[index][row], kind) for index, row in every])) + least
-        while float((more := (own / own[chosen].amax(0)).amax(1)).max()) > math.sqrt(OTHER_LIGHT):
-            chosen.append(int(more.argmax()))
-    for other in score.argsort(descending=True, stable=True).tolist():
-        if other not in chosen and sum(sizes[k] for k in chosen) + sizes[other] <= pixels:
-            chosen.append(other)
-    if side is None:
-        pixels //= len(chosen)
-        side = int((pixels / (len(KINDS) + 2)) ** 0.5)
-    samples = []
-    for index, (scene, found) in enumerate(zip(scenes, surveys, strict=True)):
-        rows = {row for owner, (of, row) in enumerate(every) if of == index and owner in chosen}
-        if rows:
-            ends = [min(range(len(found)), key=lambda row: found[row].far.min().item())]
-            ends += [max(range(len(found)), key=lambda row: found[row].near.max().item())]
-            rows |= set(ends) if found[ends[0]].far.min() < found[ends[1]].near.max() else set()
-            first = every.index((index, 0))
-            samples.append(_sample(scene, found, sorted(rows), first=first, side=side, pixels=pixels))
-    return samples
-
-
-def _sample(
-    scene: Scene, surveys: Sequence[Survey], rows: Sequence[int], *, first: int, side: int, pixels: int
-) -> Sample:
-    """Some scenes of a batch, whole or in crops: of each the tile with the largest potential of each kind, with what
-    its blur reaches, and the tiles of the farthest and the nearest point.
-
-    By gain x potential the error of the crops stands for that of the scene, relative to what is recorded of it.
-    """
-    _, height, width = scene.shape
-    crops: list[tuple[int, int, int]] = []
-    factors = {}
-    blur = max(float(surveys[row].blur.max()) for row in rows)
-    extent = side + 2 * math.ceil(blur)
-    for row in rows:
-        found = surveys[row]
-        ends = [1e9 - found.far, found.near] if float(found.near.max()) > float(found.far.min()) else []
-        kinds = [*found.potential, found.recorded]
-        seen = torch.zeros_like(found.recorded, dtype=torch.bool)
-        for kind in [*kinds, *ends]:
-            tile = divmod(int(kind.argmax()), kind.shape[1])
-            if not seen.any() or (bool(kind.any()) and not bool(seen[tile])):
-                top, of_rows = _window(tile[0], len(kind), extent, height)
-                left, of_columns = _window(tile[1], kind.shape[1], extent, width)
-                seen |= of_rows[:, None] & of_columns
-                crops.append((row, top, left))
-        covered = [float(kind[seen].sum() / kind.sum()) for kind in kinds if kind.any()]
-        factors[row] = math.sqrt(covered[-1] / min(covered)) if covered else 1.0
-    size = {"height": min(extent, height), "width": min(extent, width)}
-    if height * width <= pixels or len(rows) * height * width <= len(crops) * size["height"] * size["width"]:
-        part = [scene.samples([row]) for row in rows]
-        crops, factors = [(row, 0, 0) for row in rows], dict.fromkeys(rows, 1.0)
-    else:
-        part = [scene.crop(top=top, left=left, **size).samples([row]) for row, top, left in crops]
-    maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
-    depth: float | Tensor = scene.depth
-    if isinstance(depth, Tensor):  # maps, or numbers of one per sample
-        depth = torch.cat(maps) if maps else torch.tensor([one.depth for one in part], dtype=torch.float64)
-    together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
-    owners = tuple(first + row for row, _, _ in crops)
-    places = None
-    if together.shape[1:] != (height, width):
-        middle = (together.shape[2] - width) / 2, (together.shape[1] - height) / 2
-        places = tuple((left + middle[0], top + middle[1]) for _, top, left in crops)
-    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops), places, (height, width))
-
-
-def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:
-    """Where a window around a tile starts along one side of a picture, and which tiles have their centre in it."""
-    extent = min(extent, length)
-    start = min(max(0, tile * TILE + (TILE - extent) // 2), length - extent)
-    centres = (torch.arange(count) * TILE + TILE // 2).clamp(max=length - 1)
-    return start, (centres >= start) & (centres < start + extent)

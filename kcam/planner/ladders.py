@@ -6,10 +6,8 @@ To add a choice, write a function that gives its ladder, and a row of `LADDERS`.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,24 +16,16 @@ from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.source import Points
-from kcam.planner.band_counts import FEW_BANDS, GREY, GRIDS, ROUND, group_counts, interpolated, node_counts
+from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
-from kcam.planner.spectra import Care
+from kcam.planner.ladder import Ladder, Level
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
 """Of the settings beside which a choice is priced: layers, and pixels of the PSF beyond its rays."""
 
-ORDERS = (1.0, 1.5)
-"""A ladder's error falls at least with such a power of its step: one where phases jump, two where it is fine enough."""
-
 QUADRATURE = (1.25, 2.0)
-"""The same of groups of wavelengths: with these 51 estimates from below were 1.1 to 25 times the truth."""
-
-STEP = 1.5
-"""How much finer the rung is at least, by whose step from here an error is foretold: of smaller ones most would be
-foretold, not seen.
-"""
+"""`ORDERS` of groups of wavelengths: with these 51 estimates from below were 1.1 to 25 times the truth."""
 
 FASTEST, FASTEST_COLOURS = 2.0, 4.0
 """With which power of its step hardly a ladder's error falls, of layers and of groups of wavelengths: of 36 deep scenes
@@ -51,14 +41,8 @@ only refuse, and of pupil samples at one wavelength instead of a few. Of the lar
 were 0.52 to 3.1 times the others, and of 150, where they were above `COARSE`, 0.37 to 3.7 times.
 """
 
-COLOURFUL = 2.0
-"""How many times as much windows may cost at a few wavelengths as at one that tells of them."""
-
 COARSE = 2e-4
 """Of pupil samples at one wavelength, which may have the same grid either way, where others have not."""
-
-LITTLE = 1 / 2
-"""Of the error that there may be, that a rough estimate may be at its largest and be taken."""
 
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
@@ -78,228 +62,6 @@ MOST = 0.7  # of all layers: more of them save next to nothing, and where each d
 MARKS = (5, 13, 33)  # of these, by which the others are priced
 KAPPAS = (1.3, 1.7, 2.1)
 RANKS = (1, 2, 3, 4, 6, 9, 14)
-
-
-@dataclass(frozen=True)
-class Level:
-    """A rung: what it is called, what it changes in the Imaging, and how fine it is (where rungs converge)."""
-
-    label: str
-    changes: dict[str, Any]
-    fineness: float = 1.0
-
-
-@dataclass
-class Ladder:
-    """A choice: its rungs from the cheapest to the reference, the settings beside which it is priced, and where it is.
-
-    successive: an error follows from the steps between rungs, by their order of convergence: for ladders whose top
-    costs as much as the reference picture; orders: in between those two. Else it is that against the top.
-    blurs: whether it only matters where there is blur.
-    alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
-    follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
-    fineness of its rungs beyond which they do not.
-    off_by: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether
-    rungs are looked at from the top down, to the last that may do alone; where there is a rough estimate, that is asked
-    first, the others are priced at one wavelength, and it says what more of them add. fastest: with which power of its
-    step its error falls at most, so that rungs which cannot do are not looked at; None where any may do. marks:
-    fineness of the rungs by which others are priced, of successive ones: few, so that these are computed once.
-    least: the error that any rung is said to have, of rounding that its pricing does not see.
-    doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
-    urgency: how much more its error counts than others' where the next ladder to climb is chosen.
-    """
-
-    effect: str
-    levels: list[Level]
-    beside: dict[str, Any]
-    successive: bool = False
-    blurs: bool = True
-    alternatives: Callable[[Level], list[Level]] | None = None
-    follows: Ladder | None = None
-    settled: float = math.inf
-    off_by: float = 1.0
-    orders: tuple[float, float] = ORDERS
-    from_top: bool = False
-    fastest: float | None = None
-    marks: tuple[int, ...] = ()
-    least: float = 0.0
-    doubtful: bool = False
-    urgency: float = 1.0
-    position: int = 0
-    errors: dict[tuple[int, int], float] = field(default_factory=dict)
-    roughly: dict[Care, dict[tuple[int, int], float]] = field(default_factory=lambda: defaultdict(dict))
-    grey: dict[tuple[int, int], float] = field(default_factory=dict)
-    compared: set[tuple[int, int]] = field(default_factory=set)
-
-    @property
-    def level(self) -> Level:
-        """The rung that it stands on."""
-        return self.levels[self.position]
-
-    @property
-    def at_top(self) -> bool:
-        """Whether it is the reference physics."""
-        return self.position == len(self.levels) - 1
-
-    @property
-    def error(self) -> float:
-        """Estimated, of the rung that it stands on: what is known roughly alone is as large as it may be, and at one
-        wavelength as large as it is at least.
-        """
-        return self._error(self.position)
-
-    def _error(self, position: int) -> float:
-        key = self._key(position)
-        if position == len(self.levels) - 1:
-            return 0.0
-        known = self.errors if key in self.errors else self.grey
-        return max(known[key], self.least) if key in known else self.off_by * self.roughly[Care.ROUGH][key]
-
-    def _key(self, position: int) -> tuple[int, int]:
-        return position, self._followed
-
-    @property
-    def _followed(self) -> int:
-        """The rung of the ladder that it follows, if any, or one that tells as much."""
-        if self.follows is None:
-            return 0
-        position, below = self.follows.position, self.follows.levels[: self.follows.position]
-        return next((index for index, level in enumerate(below) if level.fineness >= self.settled), position)
-
-    def price(self, evaluator: Evaluator, most: float) -> None:
-        """Estimate the error of the rung that it stands on, of which there may be so much at most."""
-        if self.from_top and self.position == 0:
-            self.position = self._lowest(evaluator, most)
-        self._price(evaluator, self.position, most)
-
-    def _lowest(self, evaluator: Evaluator, most: float) -> int:
-        """The lowest rung whose error may do alone, as may those of all above it."""
-        low = len(self.levels) - 1
-        if low > 0 and self.off_by > 1 and self._roughly(evaluator, low - 1, Care.AT_FIRST) > self.off_by * most:
-            return low
-        while low > 0:
-            self._price(evaluator, low - 1, most)
-            if self._error(low - 1) > most:
-                break
-            low -= 1
-        return low
-
-    def _price(self, evaluator: Evaluator, position: int, most: float) -> None:
-        key = self._key(position)
-        if position == len(self.levels) - 1 or key in self.errors:
-            return
-        if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing, one PSF has one colour
-            self.errors[key] = 0.0
-        elif self.successive:
-            self.errors[key] = self._beyond(evaluator)
-        elif self.from_top and self.off_by > 1:
-            if key not in self.grey:
-                self.levels[position], self.grey[key] = self._best(evaluator, position, **GREY)
-            if self.grey[key] <= most:
-                self.errors[key] = self._coloured(evaluator, position)
-        elif self.off_by == 1 or not self._settled(self._roughly(evaluator, position), most):
-            self.levels[position], self.errors[key] = self._best(evaluator, position)
-
-    def _coloured(self, evaluator: Evaluator, position: int) -> float:
-        """The error of a rung by what it is at one wavelength, and how much more it is at a few, roughly. Where that is
-        much, of a lens that one wavelength sees in focus, halfway to what is said of these few.
-        """
-        roughly = self._roughly(evaluator, position)
-        grey = self._best(evaluator, position, Care.ROUGH, **GREY)[1]
-        more = max(1.0, roughly / grey) if grey else 1.0
-        error = self.grey[self._key(position)] * more
-        return error if more < COLOURFUL else max(error, math.sqrt(error * roughly))
-
-    def _best(
-        self, evaluator: Evaluator, position: int, care: Care = Care.FULL, **settings: Any
-    ) -> tuple[Level, float]:
-        """Of a rung and its alternatives that with the smallest error; settings: beside its own."""
-        beside = self.beside | settings | (self.follows.levels[self._followed].changes if self.follows else {})
-        level = self.levels[position]
-        candidates = [level] + (self.alternatives(level) if self.alternatives else [])
-        top = beside | self.levels[-1].changes
-        errors = [evaluator.error(beside | level.changes, top, care) for level in candidates]
-        best = min(range(len(errors)), key=errors.__getitem__)
-        return candidates[best], max(errors[best], self.least)
-
-    def _roughly(self, evaluator: Evaluator, position: int, care: Care = Care.ROUGH) -> float:
-        key, known = self._key(position), self.roughly[care]
-        if key not in known:
-            known[key] = self._best(evaluator, position, care)[1]
-        return known[key]
-
-    def _settled(self, roughly: float, most: float) -> bool:
-        """Whether a rough estimate says enough: that this may do in any case, or in none."""
-        return self.off_by * roughly <= LITTLE * most or roughly > self.off_by * most
-
-    def _beyond(self, evaluator: Evaluator) -> float:
-        """What is left from here to where rungs converge, by the steps up to here; at the foot, and where rungs are
-        marked, by the next one.
-
-        Of order p, e = step r / (1 - r), r = (fineness below / fineness)^p; p from two steps, if there are two: that
-        of their middles.
-        """
-        if self.marks:
-            return self._by_the_next(evaluator)
-        priced = {position for position, _ in self.errors}
-        below = sorted(low for low in priced if STEP * self.levels[low].fineness <= self.level.fineness)[-2:]
-        if not below:
-            return self._by_the_next(evaluator)
-        places = (*below, self.position)
-        known = [self.beside | self.levels[position].changes for position in places]
-        steps = [evaluator.error(below, above) for below, above in pairwise(known)]
-        finer = [math.log(above / below) for below, above in pairwise(self.levels[at].fineness for at in places)]
-        order, most = self.orders
-        if len(steps) > 1 and 0 < steps[1] < steps[0]:
-            fall = math.log(steps[0] / steps[1] * finer[1] / finer[0])
-            order = min(max(2 * fall / sum(finer), order), most)
-        return steps[-1] / math.expm1(order * finer[-1])
-
-    def _by_the_next(self, evaluator: Evaluator) -> float:
-        """What is left from here, by the step to the next rung that is finer enough, and the order from there on."""
-        upper = self.levels[self._above]
-        step = evaluator.error(self.beside | self.level.changes, self.beside | upper.changes)
-        top = self._above + 1 == len(self.levels)
-        return step if top else step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
-
-    @property
-    def _above(self) -> int:
-        """The next rung by a `STEP`, or mark, or the top."""
-        finer = (index for index, level in enumerate(self.levels) if level.fineness >= STEP * self.level.fineness)
-        marked = (index for index in finer if not self.marks or self.levels[index].fineness in self.marks)
-        return next(marked, len(self.levels) - 1)
-
-    def climb(self, evaluator: Evaluator, most: float) -> None:
-        """One rung up, and its error, of which there may be so much at most; first, what a finer one says of this one,
-        which may then do. Rungs that cannot do, at the fastest that errors fall, are not looked at.
-        """
-        key = self._key(self.position)
-        unseen = not self.marks and self._above + 1 < len(self.levels) and key not in self.compared
-        if self.successive and self.position > 0 and unseen:
-            self.compared.add(key)
-            self.errors[key] = self._by_the_next(evaluator)
-            return
-        before = self.position
-        self.position += 1
-        while not self.at_top and self._at_best(before) > most:
-            self.position += 1
-        self.price(evaluator, most)
-
-    def _at_best(self, known: int) -> float:
-        """The error of this rung, if from a known one it fell as fast as any."""
-        if self.fastest is None:
-            return 0.0
-        return self.errors[self._key(known)] * (self.levels[known].fineness / self.level.fineness) ** self.fastest
-
-    def why(self) -> str:
-        """The number that decided."""
-        if self.position == 0:
-            return "" if len(self.levels) == 1 else "the least there is suffices"
-        known = self.roughly[Care.AT_FIRST] | self.roughly[Care.ROUGH] | self.grey | self.errors
-        below = max((key for key in known if key[0] < self.position), default=None)
-        if below is None:
-            return "would save less time than it takes to find out"
-        return f"{self.levels[below[0]].label} would cost {known[below]:.2g}"
 
 
 def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:

@@ -6,24 +6,23 @@ import dataclasses
 import math
 import statistics
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
 from kcam.camera import Camera
-from kcam.context import Stage
-from kcam.effects import Skippable, Work
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
-from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
-from kcam.planner.ladders import Ladder, ladders
+from kcam.planner.ladder import Ladder
+from kcam.planner.ladders import ladders
 from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_raw, shortened, together
+from kcam.planner.prices import Prices
 from kcam.planner.range import Range
+from kcam.planner.skips import Skip, shortcuts_of
 from kcam.scene import Scene
-from kcam.sensor import ADC, ColourFilter, ShotNoise
-from kcam.sensor.random_stage import RandomStage
+from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free
 
 WORTH, WORTH_DEEP = 0.2, 0.4
@@ -33,11 +32,6 @@ map of depth; each picture of a batch adds an eighth: measured.
 
 SENSOR = "sensor"
 """The tolerance that follows from what a sensor records."""
-
-NOISE_SHARE = 0.1
-"""Of all noise, that a source may be and be left out where the sensor sets the tolerance: 0.5 % of the sum."""
-
-GAIN = 0.98  # of the time, that a choice must leave to be considered
 
 
 def make_plan(
@@ -121,9 +115,9 @@ class Planner:
         _check_scenes(self.scenes, max_memory)
         self.evaluator = Evaluator(camera, self.scenes)
         always = {} if max_memory is None else {"max_memory": float(max_memory)}
-        self.prices = _Prices(camera, self.evaluator, self.scenes, always, one=one)
+        self.prices = Prices(camera, self.evaluator, self.scenes, always, one=one)
         self._checked: dict[tuple[Any, ...], float] = {}
-        self._known: tuple[list[Ladder], list[_Skip]] | None = None
+        self._known: tuple[list[Ladder], list[Skip]] | None = None
         self._setup = time.perf_counter() - start
 
     @property
@@ -154,7 +148,7 @@ class Planner:
             for choice in movable:
                 choice.position = 0
             checked = self._settle(ladders, skips, allowed, noise if isinstance(tolerance, str) else None)
-            shortcuts = _shortcuts(skips, allowed, noise if isinstance(tolerance, str) else None)
+            shortcuts = shortcuts_of(skips, allowed, noise if isinstance(tolerance, str) else None)
             for ladder in _relevant(ladders):
                 rows.add_ladder(ladder)
             rows.add_way()
@@ -192,7 +186,7 @@ class Planner:
             planning_seconds=self._setup + time.perf_counter() - start,
         )
 
-    def _settle(self, steps: list[Ladder], skips: list[_Skip], allowed: float, noise: float | None) -> float | None:
+    def _settle(self, steps: list[Ladder], skips: list[Skip], allowed: float, noise: float | None) -> float | None:
         """Climb until the estimates fit, and where those of one choice tell little of another's on until the last trial
         does; gives the error that it found.
         """
@@ -219,7 +213,7 @@ class Planner:
             if not below:
                 return 0.0
             changes = _changes(steps)
-            shortcuts = _shortcuts(skips, allowed, noise)
+            shortcuts = shortcuts_of(skips, allowed, noise)
             key = tuple(sorted(changes.items())), repr(sorted(shortcuts.items()))
             if key not in self._checked:
                 self._checked[key] = self.evaluator.last(changes, shortcuts)
@@ -227,13 +221,13 @@ class Planner:
                 return self._checked[key]
             max(below, key=_urgency).climb(self.evaluator, allowed / SAFETY)
 
-    def _ways(self) -> tuple[list[Ladder], list[_Skip]]:
+    def _ways(self) -> tuple[list[Ladder], list[Skip]]:
         """All choices."""
         if self._known is None:
             prices = self.prices
             every = ladders(self.evaluator, prices.scene, one=self.one)
             steps = [ladder for ladder in every if not ladder.doubtful or self.prices.saves(ladder)]
-            skips = [_Skip(self.camera, index, self.evaluator) for index in self.evaluator.skippable()]
+            skips = [Skip(self.camera, index, self.evaluator) for index in self.evaluator.skippable()]
             self._known = steps, skips
         return self._known
 
@@ -326,7 +320,7 @@ def _changes(steps: Sequence[Ladder]) -> dict[str, Any]:
     return {key: value for ladder in _relevant(steps) for key, value in ladder.level.changes.items()}
 
 
-def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator, most: float) -> None:
+def _climb(steps: Sequence[Ladder], skips: Sequence[Skip], evaluator: Evaluator, most: float) -> None:
     """One rung at a time, on the ladder with the largest error, until all together fit; followers last."""
     movable: list[Any] = [skip for skip in skips if skip.counted]
     while True:
@@ -342,146 +336,15 @@ def _climb(steps: Sequence[Ladder], skips: Sequence[_Skip], evaluator: Evaluator
             return
 
 
-def _urgency(way: Ladder | _Skip) -> float:
+def _urgency(way: Ladder | Skip) -> float:
     """Its error, counted more where leaving it saves nothing."""
     return way.error * (way.urgency if isinstance(way, Ladder) else 1.0)
-
-
-class _Skip:
-    """A stage that may be left out, or take a cheaper form (`cheaper`): a ladder where its error counts."""
-
-    def __init__(self, camera: Camera, index: int, evaluator: Evaluator) -> None:
-        self.stage: Any = camera[index]
-        self.index, self.position = index, 0
-        self.counted = not isinstance(self.stage, (RandomStage, ADC))
-        found = [given[index] for given in evaluator.signals]
-        dimmed = zip(evaluator.dimmings, found, strict=True)
-        errors = [times * self.stage.error_if_skipped(*signal) for times, signal in dimmed]
-        worst = max(range(len(errors)), key=errors.__getitem__)
-        seen = ", without blur" if evaluator.dimmed else ""
-        self.error_if_skipped, self.reason = errors[worst], self.stage.reason(*found[worst]) + seen
-        forms = getattr(self.stage, "cheaper", None)
-        self.forms = [("left out", None, self.error_if_skipped), *(forms(*found[worst]) if callable(forms) else ())]
-
-    @property
-    def error(self) -> float:
-        """Estimated, as it is now."""
-        return 0.0 if self.at_top else self.forms[self.position][2]
-
-    @property
-    def at_top(self) -> bool:
-        """Whether it is kept."""
-        return self.position == len(self.forms)
-
-    def price(self, evaluator: Evaluator, most: float) -> None:
-        """It is known."""
-
-    def climb(self, evaluator: Evaluator, most: float) -> None:
-        """To the next form that does better, or the stage itself."""
-        before = self.error
-        self.position += 1
-        while self.error >= before and not self.at_top:
-            self.position += 1
-
-
-def _shortcuts(skips: Sequence[_Skip], allowed: float, noise: float | None) -> dict[int, dict[str, Any] | None]:
-    """Stages to leave out or to replace: by those whose errors count; noise and rounding that are small by
-    themselves are left out.
-
-    Together they stay below the tolerance; where the noise itself sets it, each source below a tenth of it.
-    """
-    chosen = {skip.index: skip.forms[skip.position][1] for skip in skips if skip.counted and not skip.at_top}
-    left_out = 0.0
-    for skip in sorted((skip for skip in skips if not skip.counted), key=lambda skip: skip.error):
-        left_out = math.hypot(left_out, skip.error)
-        if left_out <= (allowed if noise is None else NOISE_SHARE * noise):
-            chosen[skip.index] = None
-    return chosen
-
-
-class _Prices:
-    """Predicted time and memory of the raw of the scene that takes longest.
-
-    stages: seconds of each stage that says its cost, beside the optics, by its index.
-    """
-
-    def __init__(
-        self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any], *, one: bool
-    ) -> None:
-        self.evaluator, self.imaging, self.always = evaluator, evaluator.imaging, always
-        self.apart = evaluator.apart if evaluator.varies and evaluator.samples and not one else None
-        self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
-        self.channels = self._channels(camera, scenes[0])
-        self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
-        self.scene = scenes[0]
-        if len(scenes) > 1:
-            self.scene = max(scenes, key=lambda scene: self._seconds(scene))
-        self.context = camera.resolve(self.scene)
-        self.given = dict(self._given(camera))
-        self.stages = {index: self.of_stage(index, camera[index]) for index in self.given}
-
-    def _given(self, camera: Camera) -> Iterator[tuple[int, torch.Tensor]]:
-        """Index of each stage that says its cost, up to the ADC, and a signal as large as the one that it is given."""
-        batch, height, width = self.scene.shape
-        channels = self.channels or 1
-        for index, stage in enumerate(camera):
-            if isinstance(stage, Skippable) and not isinstance(stage, Imaging):
-                yield index, torch.zeros(()).expand(batch, channels, height, width)
-            channels = stage.output_channels(channels, self.context) if isinstance(stage, Stage) else channels
-            if isinstance(stage, ENDS):
-                return
-
-    def of_stage(self, index: int, stage: Any) -> float:
-        """Seconds of a stage in this place."""
-        signal = self.given[index]
-        return self.rates["touch"] * signal.numel() * stage.cost(signal, self.context)
-
-    @staticmethod
-    def _channels(camera: Camera, scene: Scene) -> int | None:
-        for stage in camera:
-            if isinstance(stage, ColourFilter):
-                return stage.contraction(scene.wavelengths).shape[0]
-        return None
-
-    def _seconds(self, scene: Scene) -> float:
-        return 0.0 if self.imaging is None else costs.seconds(self._work(scene, {}), self.rates)
-
-    def work(self, changes: Mapping[str, Any]) -> Work:
-        """With changes of the Imaging."""
-        return self._work(self.scene, changes)
-
-    def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
-        if self.imaging is None:
-            return Work()
-        imaging = self.imaging.changed(**self.always | dict(changes))
-        known = None
-        if torch.as_tensor(scene.depth).ndim != 1:  # else each distance is a picture of its own
-            known = self.evaluator.laid_out(imaging, scene)
-        return imaging.work(scene, channels=self.channels, apart=self.apart, known=known)
-
-    def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
-        """(seconds, bytes) with changes of the Imaging."""
-        key = tuple(sorted(changes.items()))
-        if key not in self.kept:
-            work = self.work(changes)
-            self.kept[key] = (costs.seconds(work, self.rates), work.memory)
-        return self.kept[key]
-
-    def saves(self, ladder: Ladder) -> bool:
-        """Whether its cheapest rung takes less time than its top."""
-        return self.of(ladder.levels[0].changes)[0] <= GAIN * self.of({})[0] or len(ladder.levels) == 1
-
-    def worth(self, ladder: Ladder, changes: Mapping[str, Any]) -> bool:
-        """Whether its cheapest rung saves more beside such changes than pricing it takes."""
-        foot, beside = ladder.levels[0].changes, ladder.beside
-        saved = self.of(changes)[0] - self.of({**changes, **foot})[0]
-        return saved > self.of(beside)[0] + self.of({**beside, **foot})[0]
 
 
 class _Rows:
     """The decisions, one after the other, and what is spent after each."""
 
-    def __init__(self, price: _Prices) -> None:
+    def __init__(self, price: Prices) -> None:
         self.price = price
         self.decisions: list[Decision] = []
         self.changes: dict[str, Any] = dict(price.always)
@@ -513,7 +376,7 @@ class _Rows:
         else:
             self._add("convolution", "by FFT", "", "")
 
-    def add_skip(self, skip: _Skip, *, left_out: bool) -> None:
+    def add_skip(self, skip: Skip, *, left_out: bool) -> None:
         """A stage of the sensor, or of the user's."""
         name = type(skip.stage).__name__
         error = skip.error_if_skipped if left_out or not skip.counted else skip.error

@@ -123,12 +123,12 @@ class Spectra:
         Returns: whether spectra tell of this scene: not where much more is recorded, of light that goes on beyond a
         replicated border.
         """
-        said = self._whole(settings, exactly=True)
+        said = self._whole(settings, Way.PSFS)
         if self.imaging.border == "replicate" and bool((recorded > _GOES_ON * said).any()):
             return False
         if bool(cut.any()):
             every = {**settings, "bands": None}
-            said = torch.where(cut, self._whole(every, exactly=False), said)
+            said = torch.where(cut, self._whole(every, Way.LINES), said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
         return True
 
@@ -139,16 +139,16 @@ class Spectra:
 
     def dimmed(self, settings: Mapping[str, Any]) -> list[float]:
         """How much less light there is of each row with some settings than without blur: RMS over RMS."""
-        sharp, seen = (self._whole(own, exactly=False) for own in ({**settings, "blur": False}, settings))
+        sharp, seen = (self._whole(own, Way.LINES) for own in ({**settings, "blur": False}, settings))
         found: list[float] = (sharp / seen.clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
         return found
 
-    def _whole(self, settings: Mapping[str, Any], *, exactly: bool) -> Tensor:
+    def _whole(self, settings: Mapping[str, Any], way: Way) -> Tensor:
         """The energy of each row with some settings, (B,)."""
         found = torch.zeros(len(self.scene.coefficients), dtype=torch.float64)
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, settings.get("layers"))
-            found[rows] = self._energy(self._once(index, layered, settings, settings, Way(exactly)), layered)
+            found[rows] = self._energy(self._once(index, layered, settings, settings, way), layered)
         return found
 
     @functools.cached_property
@@ -263,9 +263,14 @@ class Spectra:
         self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        exactly = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - WINDOW)
-        few = _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= GROUPS
-        way = Way(exactly, few, care is Care.AT_FIRST)
+        if _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - WINDOW):
+            way = Way.PSFS
+        elif care is Care.AT_FIRST:
+            way = Way.WHOLE_LINES
+        elif _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= GROUPS:
+            way = Way.BETWEEN_LINES
+        else:
+            way = Way.LINES
         factor = self.optics.corners
         if _differ(changes, against, {"interpolate_bands"}):
             factor *= self.optics.between_psfs

@@ -9,7 +9,8 @@ import math
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from enum import Enum, auto
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,14 +36,15 @@ _AROUND = 4  # pixels around the rays of a PSF, within which there is light that
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 
 
-class Way(NamedTuple):
-    """How transfer functions are found. exactly: by PSFs or tables; else by line spreads, where there are any. few: of
-    wavelengths between some. cut: in a smaller window, by those of the whole.
+class Way(Enum):
+    """How transfer functions are found that are in no table: by PSFs; by line spreads, where there are any: of each
+    wavelength, of most between some, or of the whole window, of which a smaller one cuts some off.
     """
 
-    exactly: bool = False
-    few: bool = False
-    cut: bool = False
+    PSFS = auto()
+    LINES = auto()
+    BETWEEN_LINES = auto()
+    WHOLE_LINES = auto()
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class Transfers:
         """
         groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
         shares = imaging.shares(wavelengths, deep=self.deep)
-        many = way.few and self.deep and not way.exactly and shares is None and len(groups) > _BETWEEN_LINES
+        many = way is Way.BETWEEN_LINES and self.deep and shares is None and len(groups) > _BETWEEN_LINES
         if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
             groups, shares = few_wavelengths(wavelengths, _BETWEEN_LINES, interpolate=True)
         return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
@@ -122,8 +124,9 @@ class Transfers:
             return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
         window = self.window(imaging, vergences)
         known = self.table(imaging, vergences, wavelengths, grey=grey)
-        if known is None and not way.exactly:
-            known = self.lines(self._wider(imaging, vergences) if way.cut else imaging, vergences, wavelengths)
+        if known is None and way is not Way.PSFS:
+            own = self._wider(imaging, vergences) if way is Way.WHOLE_LINES else imaging
+            known = self.lines(own, vergences, wavelengths)
         if known is None:
             found = self._of_psfs(imaging, vergences, wavelengths, window)
         else:

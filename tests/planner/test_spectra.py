@@ -19,7 +19,8 @@ from kcam.planner import Planner, costs, transfers
 from kcam.planner import spectra as spectra_module
 from kcam.planner.band_counts import group_counts, node_counts
 from kcam.planner.evaluation import Evaluator, _error
-from kcam.planner.ladders import FASTEST, LITTLE, MARKS, ORDERS, QUADRATURE, Ladder, Level
+from kcam.planner.ladder import LITTLE, ORDERS, Ladder, Level
+from kcam.planner.ladders import FASTEST, MARKS, QUADRATURE
 from kcam.planner.spectra import Care, Spectra, _compressed
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -427,10 +428,14 @@ def test_distances_may_have_windows_of_their_own() -> None:
     plate = optics.ZernikeDOE(0.6 * torch.eye(8, dtype=torch.float64)[5])
     lens = optics.Lens(optics.CircularAperture(8 * mm), optics.ThinLens(25 * mm), plate, focus_distance=2.0)
     camera = Camera(optics.Imaging(lens, pixel_pitch=8 * um), sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB"))
-    light = Scene.builtin("coffee", size=192).coefficients[:, :, :128]
+    coffee, bands = Scene.builtin("coffee", size=192), slice(3, None, 7)
+    light, few = coffee.bands()[:, bands, :128], coffee.wavelengths[bands]
+    near, far = (Scene.from_bands(light, wavelengths=few, depth=depth) for depth in (0.6, 2.0))
+    batch = Scene.from_bands(light.expand(2, -1, -1, -1), wavelengths=few, depth=torch.tensor([0.6, 2.0]))
+    windows = {camera[0].psf_window(few, vergences=torch.tensor([1 / z]), picture=(128, 192)) for z in (0.6, 2.0)}
+    assert len(windows) == 2
     with torch.no_grad():
-        batch = Scene.from_rgb(light.expand(2, -1, -1, -1), depth=torch.tensor([0.6, 2.0]))
-        for scenes in (batch, [Scene.from_rgb(light, depth=0.6), Scene.from_rgb(light, depth=2.0)]):
+        for scenes in (batch, [near, far]):
             planner = Planner(camera, scenes)
             for tolerance in (0.03, 0.003):
                 assert planner.plan(tolerance).bound <= tolerance
