@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import random
 
 import numpy as np
 import oracles
@@ -349,6 +350,21 @@ def test_small_windows_take_the_matrix_form_and_large_ones_the_chirp() -> None:
     lens = small_lens(optics.ZernikeDOE(torch.zeros(4)))
     assert choose(query(lens, 65)).method == "matrix"
     assert choose(query(lens, 4097)).method in ("chirp_z", "fft")
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_fft_is_chosen_whose_many_grids_take_ten_times_as_long(seed: int) -> None:
+    """Of aberrated lenses far out of focus: it has twice the samples on each axis, and paths for each wavelength."""
+    draw = random.Random(seed)
+    plate = optics.ZernikeDOE(draw.uniform(0.1, 1) * torch.eye(8, dtype=torch.float64)[5])
+    lens = optics.Lens(
+        optics.CircularAperture(draw.uniform(3, 8) * mm), optics.ThinLens(25 * mm), plate, focus_distance=2.0
+    )
+    asked = lens.query(
+        [450 * nm, 650 * nm], distances=draw.uniform(0.5, 3), pixel_pitch=draw.uniform(2, 8) * um,
+        shape=(draw.randint(33, 257), draw.randint(33, 257)),
+    )  # fmt: skip
+    assert choose(asked).method in ("matrix", "chirp_z")
 
 
 @pytest.mark.parametrize("physics", PHYSICS)

@@ -26,7 +26,8 @@ from kcam.optics.pupil.rim import round_weights
 from kcam.optics.pupil.warp import Warp
 
 _GROUP_NUMBERS = 2**26  # pupils and images that wavelengths computed together may hold: 256 MB in float32
-_MAP_SETUP = 2e5  # operations for each pupil sample, of weights that bring a map onto a new grid; measured on a CPU
+_MAP_SETUP, _SETUP = 2e5, 1e4  # operations for each pupil sample of a new grid, of weights that bring a map of pixels
+# onto it, and of paths alone where the grid is larger than a processor's cache; measured on a CPU
 
 
 def grid_psf(query: Query, *, method: str) -> Tensor:
@@ -288,8 +289,8 @@ def _chirp_z_cost(query: Query) -> float:
 
 
 def _fft_cost(query: Query) -> float:
-    # its grid scales with the wavelength, and each grid needs weights of its own
-    total, setup = 0.0, _MAP_SETUP if query.lens.has_pixels else 0.0
+    # its grid scales with the wavelength, and each grid needs paths and weights of its own
+    total, setup = 0.0, _MAP_SETUP if query.lens.has_pixels else _SETUP
     for n, m in _sizes(query):
         length = max(2 * n, m)
         total += FFT_SLOWNESS * 10 * length**2 * math.log2(length) + setup * n**2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 import torch
@@ -102,16 +103,27 @@ def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     taps = kernel.shape[-1]
     # node j sits at the centre of cell 5 j + 2; its taps reach across the axis, where the area is odd in each edge
     edges = (np.arange((half - 1) * FINE + taps + 1) + (FINE - 1) // 2 - taps // 2) * cell
-    quadrant = torch.empty(half, half, dtype=torch.float64)
+    quadrant = torch.zeros(half, half, dtype=torch.float64)
     for first in range(0, half, _NODES_AT_ONCE):  # of cells 25 times as many as nodes only a few rows are held
         last = min(first + _NODES_AT_ONCE, half)
-        rows = edges[first * FINE : (last - 1) * FINE + taps + 1, None]
-        area = disc_area_below(np.abs(rows), np.abs(edges)) * np.sign(rows) * np.sign(edges)
+        start, stop = _near_rim(first, last, radius / spacing)
+        quadrant[first:last, :start] = 1.0
+        if start >= (stop := min(stop, half)):
+            continue
+        rows, columns = (edges[a * FINE : (b - 1) * FINE + taps + 1] for a, b in ((first, last), (start, stop)))
+        area = disc_area_below(np.abs(rows[:, None]), np.abs(columns)) * np.sign(rows[:, None]) * np.sign(columns)
         signal = torch.as_tensor(np.diff(np.diff(area, axis=0), axis=1) / cell**2)
         for _ in range(2):  # along the rows, then (transposed) along the columns
             signal = torch.nn.functional.conv1d(signal[:, None], kernel, stride=FINE)[:, 0].T
-        quadrant[first:last] = signal
+        quadrant[first:last, start:stop] = signal
     return quadrant
+
+
+def _near_rim(first: int, last: int, radius: float) -> tuple[int, int]:
+    """From and to where columns of nodes feel the rim of a disc in some rows of them; radius: in samples."""
+    low, high = max(0.0, first - _NEAR), last + _NEAR
+    outer, inner = (math.sqrt(max(0.0, radius**2 - y**2)) for y in (low, high))
+    return max(0, math.floor(inner - _NEAR)), math.ceil(outer + _NEAR) if low < radius else 0
 
 
 def round_weights(discs: tuple[tuple[float, float], ...], count: int, *, spacing: float) -> Tensor:
