@@ -279,17 +279,18 @@ class Lens(ElementStack):
     ) -> dict[str, float]:
         """What a bank takes, by kind of work; twice as many bytes take twice as long.
 
-        map: pixels of the maps, and the samples that their field is warped onto, times the terms that this takes.
+        map: pixels of the maps, and the samples that their field is warped onto, times the terms that this takes; of
+        transmissions alone, which have no imaginary part, once for all wavelengths that share a grid.
         """
         query = self.question(points, wavelengths, pixels, recipe)
         row = recipe.row(query)
         found = {row.kind: row.cost(query) * pixels.dtype.itemsize / 4}
-        if self.has_pixel_phase:
+        if query.has_pixels:
             maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
-            counts = sample_counts(query)
+            counts, parts = (sample_counts(query), 2) if self.has_pixel_phase else ({*sample_counts(query)}, 1)
             tau = float(query.tau.detach())
             warps = (0.0 if row.paraxial else warp_terms(count, tau) * count**2 for count in counts)
-            found["map"] = sum(maps + warp for warp in warps)
+            found["map"] = sum(maps + warp for warp in warps) * parts / 2
         return found
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcam.optics.autograd import once_differentiable
+from kcam.optics.autograd import apply_linear, once_differentiable
 from kcam.optics.numerics import Pair, sines
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.transforms import PlainLayout, Transform
@@ -75,19 +75,21 @@ class Cells:
             else:
                 phases.append(values)
                 factors.append(pixels.factors)
-        if not phases:
-            phases, factors = [torch.zeros_like(amplitude)], [torch.ones_like(wavelengths)]
         weights = map_weights(maps, widest, count=count, spacing=spacing, **like)
-        dispersed = torch.stack(factors).to(query.dtype)
-        return Cells(torch.as_tensor(edges), amplitude, power, torch.stack(phases), dispersed, weights)
+        none = amplitude.new_empty(0, *amplitude.shape), amplitude.new_empty(0, len(wavelengths))
+        turned, dispersed = (torch.stack(phases), torch.stack(factors).to(query.dtype)) if phases else none
+        return Cells(torch.as_tensor(edges), amplitude, power, turned, dispersed, weights)
 
     def field(self, warp: Warp | None, layout: Transform | PlainLayout) -> Tensor:
         """Transmission and phase on the true plane's grid, or on to the image-side plane's by `warp`.
 
         Real and imaginary part, (2, L, ...) in a transform's layout.
         """
-        onto = self.weights if warp is None else _Warped(self.weights, warp)
-        return _PixelField.apply(self.phases, self.factors, self.amplitude, onto, layout)
+        onto = _Onto(self.weights, warp, layout)
+        if len(self.phases):
+            return _PixelField.apply(self.phases, self.factors, self.amplitude, onto)
+        passed = apply_linear(self.amplitude, onto)  # at all wavelengths alike
+        return torch.stack([passed, torch.zeros_like(passed)])[:, None].expand(-1, self.factors.shape[1], *passed.shape)
 
     def energy(self, semi_aperture: Tensor, vergences: Tensor) -> Tensor:
         """INT power / (1 + V^2 r^2) d^2 u of spherical waves, (Z,) [m^2].
@@ -186,17 +188,20 @@ def map_weights(
 
 
 @dataclass(frozen=True)
-class _Warped:
-    """Cells onto the true plane's grid, and from there to the image-side plane."""
+class _Onto:
+    """Cells onto the true plane's grid, from there to the image-side plane where there is a warp, in a layout."""
 
     weights: MapWeights
-    warp: Warp
+    warp: Warp | None
+    layout: Transform | PlainLayout
 
     def forward(self, field: Tensor) -> Tensor:
-        return self.warp.forward(self.weights.forward(field))
+        grid = self.weights.forward(field)
+        return self.layout.arrange(grid if self.warp is None else self.warp.forward(grid))
 
-    def adjoint(self, grid: Tensor) -> Tensor:
-        return self.weights.adjoint(self.warp.adjoint(grid))
+    def adjoint(self, values: Tensor) -> Tensor:
+        grid = self.layout.disarrange(values)
+        return self.weights.adjoint(grid if self.warp is None else self.warp.adjoint(grid))
 
 
 class _PixelField(torch.autograd.Function):
@@ -207,16 +212,16 @@ class _PixelField(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, phases, factors, amplitude, onto, layout):
+    def forward(ctx, phases, factors, amplitude, onto):
         ctx.save_for_backward(phases, factors, amplitude)
-        ctx.onto, ctx.layout = onto, layout
+        ctx.onto = onto
         field = amplitude.new_empty(2, *amplitude.shape)
         grids = []
         for factor in factors.T:
             for rows in _few_rows(amplitude):
                 for values, part in zip(_sines(factor, phases[:, rows]), field, strict=True):
                     torch.mul(values, amplitude[rows], out=part[rows])
-            grids.append([layout.arrange(onto.forward(part)) for part in field])
+            grids.append([onto.forward(part) for part in field])
         return torch.stack([part for parts in zip(*grids, strict=True) for part in parts]).unflatten(0, (2, -1))
 
     @staticmethod
@@ -227,7 +232,7 @@ class _PixelField(torch.autograd.Function):
         d_amplitude = torch.zeros_like(amplitude) if ctx.needs_input_grad[2] else None
         for index, factor in enumerate(factors.T):
             with full_precision(grad.device):
-                onto_re, onto_im = (ctx.onto.adjoint(ctx.layout.disarrange(part[index])) for part in grad)
+                onto_re, onto_im = (ctx.onto.adjoint(part[index]) for part in grad)
             for rows in _few_rows(amplitude):
                 cosine, sine = _sines(factor, phases[:, rows])
                 if d_amplitude is not None:
@@ -235,7 +240,7 @@ class _PixelField(torch.autograd.Function):
                 d_angle = cosine.mul_(onto_im[rows]).addcmul_(sine, onto_re[rows], value=-1)
                 for d_phase, own in zip(d_phases, factor, strict=True):
                     d_phase[rows].addcmul_(d_angle, own)
-        return d_phases.mul_(amplitude), None, d_amplitude, None, None
+        return d_phases.mul_(amplitude), None, d_amplitude, None
 
 
 def _few_rows(cells: Tensor) -> list[slice]:

@@ -43,7 +43,7 @@ def grid_psf(query: Query, *, method: str) -> Tensor:
 def samples_by_rule(query: Query, index: int) -> int:
     """Pupil samples for a wavelength of a query by the rule of `sampling.pupil_samples`, however many."""
     needed = sampling.pupil_samples(**_geometry(query, index), kappa=query.how.kappa)
-    if query.has_pixel_phase:  # few distinct grids: each needs weights of its own for the map
+    if query.has_pixels:  # few distinct grids: each needs weights of its own for the map
         step = max(64, 2 ** (needed.bit_length() - 4))
         needed = step * math.ceil(needed / step)
     return needed

@@ -176,8 +176,13 @@ class Query:
             return float(self.image_side_semi_aperture), float(self.sensor_distance)
 
     @functools.cached_property
-    def has_pixel_phase(self) -> bool:
+    def has_pixels(self) -> bool:
         """Whether the lens has; kept, because sampling rules ask for it at each wavelength."""
+        return self.lens.has_pixels
+
+    @functools.cached_property
+    def has_pixel_phase(self) -> bool:
+        """Whether the lens has."""
         return self.lens.has_pixel_phase
 
     @functools.cached_property
