@@ -31,7 +31,7 @@ from kcam.planner.spectra import LINEAR, Care, Spectra, linear
 from kcam.planner.survey import BEYOND, CLIPPING, TILE, Survey, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, Mosaic, Transmission
-from kcam.sensor.random_stage import RandomStage
+from kcam.sensor.random_stage import Mean, RandomStage
 
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
@@ -212,8 +212,9 @@ class Evaluator:
         By spectra light beyond the full well counts too, so that they say at least as much.
         """
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
-            sharp = self._dimming if changes.get("blur") is False is against.get("blur") else 1.0
-            return sharp * _error(self.samples, self.answers(changes), self.answers(against))
+            sharp = changes.get("blur") is False is against.get("blur")
+            beside = self._dimming * max(self.lost.values(), default=1.0) if sharp and self.certain else 1.0
+            return beside * _error(self.samples, self.answers(changes), self.answers(against))
         if changes.get("occlusion") != against.get("occlusion"):
             return self._hidden(changes, against)
         found = [0.0]
@@ -309,6 +310,8 @@ class Evaluator:
         return Answer(raw.detach(), tuple(torch.zeros_like(p) if g is None else g for g, p in pairs))
 
     def _raw(self, sample: Sample, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Tensor:
+        if self.certain and changes.get("blur") is False:  # it may fill the well where blurred light does not
+            return with_imaging(self._bottomless, **changes)(sample.scene)
         if sample.places is None or not (self.imaging and self.imaging.changed(**changes).varies):
             return self._with(changes, shortcuts)(sample.scene)
         scene, reach, given = sample.scene, self.imaging.reach(sample.picture), self._always | dict(changes)
@@ -322,6 +325,13 @@ class Evaluator:
             parts = [s.part(place, reach=reach) if isinstance(s, Imaging) else s for s in stages]
             raws.append(Camera(*parts, context=stages.context)(scene.samples([row])))
         return torch.cat(raws)
+
+    @functools.cached_property
+    def _bottomless(self) -> Camera:
+        """The raw's camera without what stops at the full well."""
+        kinds = (stage.stage if isinstance(stage, Mean) else stage for stage in self.raw_camera)
+        kept = [stage for stage, own in zip(self.raw_camera, kinds, strict=True) if not isinstance(own, CLIPPING)]
+        return Camera(*kept, context=self.raw_camera.context)
 
     def _with(self, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Camera:
         if shortcuts:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import random
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -593,3 +594,32 @@ def test_rungs_that_cannot_do_are_not_looked_at(order: float, most: float) -> No
     assert ladder.at_top or truth <= 1.6 * most
     for n in set(counts[: ladder.position]) - asked:
         assert n**-order - counts[-1] ** -order > 0.6 * most
+
+
+@pytest.mark.parametrize("seed", [14, 15, 17, *(pytest.param(n, marks=pytest.mark.slow) for n in range(14))])
+def test_colours_count_where_sharp_light_fills_the_well_and_blurred_light_does_not(seed: int) -> None:
+    """The rank of a cube is looked at without blur: of edges of which one side is white, nothing would be seen."""
+    draw = random.Random(seed)
+    count = draw.choice([8, 16, 31])
+    wavelengths = torch.linspace(400, 700, count, dtype=torch.float64) * nm
+    edge = (torch.arange(72.0) > draw.uniform(20, 50)).float() + draw.uniform(0.005, 0.03)
+    light = torch.zeros(count, 40, 72)
+    for _ in range(3):
+        middle, width = draw.random(), draw.uniform(0.1, 0.6)
+        spectrum = torch.exp(-(((torch.linspace(0, 1, count) - middle) / width) ** 2))
+        light += spectrum[:, None, None] * edge.roll(draw.randint(0, 12))
+    scene = Scene.from_bands(light * draw.uniform(1, 20), wavelengths=wavelengths, depth=draw.uniform(0.3, 1.0))
+    lens = optics.Lens(
+        optics.CircularAperture(draw.uniform(2, 7) * mm), optics.ThinLens(50 * mm), focus_distance=draw.uniform(2, 6)
+    )
+    camera = Camera(
+        optics.Imaging(lens, pixel_pitch=9 * um, psf_shape=(65, 65)),
+        sensor.ColourFilter.kodak(),
+        sensor.Mosaic("RGGB"),
+        sensor.Exposure(),
+        sensor.ShotNoise(full_well=draw.choice([1000, 20_000])),
+    )
+    with torch.no_grad():
+        planner = Planner(camera, scene)
+        for tolerance in (0.03, 0.01, 0.003):
+            assert planner.plan(tolerance).measure(camera, scene) <= tolerance
