@@ -57,6 +57,8 @@ ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 """By which two ways to the same picture differ."""
 
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
+UNRECORDED, UNLIKE = 1e-3, 1.2  # RMS of light of a wavelength, of that of all, of which windows may cut off what they
+# like; how much farther rays may go at others than at those that tell of a window
 LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
 MARKS = (5, 13, 33)  # of these, by which the others are priced
@@ -92,10 +94,12 @@ class _View:
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
         ends = torch.stack([self.vergences.min(), self.vergences.max()])
         self.blur, self.row = 0.0, None
+        self.rays = torch.zeros(len(scene.wavelengths), dtype=torch.float64)  # of each wavelength, at most [pixels]
         if isinstance(lens := imaging.lens, Lens):
             pixels = imaging.pixels(self.window, planes)
             query = lens.question(Points(ends), scene.wavelengths, pixels, imaging.accuracy)
             self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
+            self.rays = query.displacement.cpu() / imaging.pixel_pitch
             self.row = None if imaging.varies else imaging.accuracy.row(query)
         elif evaluator.varies:
             self.blur = float(evaluator.defocus.radius(ends).max()) * imaging.pixel_pitch
@@ -113,6 +117,17 @@ class _View:
     def on_grid(self) -> bool:
         """Whether how finely the pupil is sampled is a choice."""
         return self.row is not None and self.row.on_grid and self.imaging.accuracy.samples is None
+
+    def unseen(self, few: int) -> float:
+        """How far rays go at any wavelength that is recorded, where so many show much less of them, as of glass far
+        out of the range for which it is corrected; else 0 [pixels].
+        """
+        light = torch.stack([one.light for one in self.evaluator.items]).amax(0)
+        recorded = self.rays[light > UNRECORDED * light.norm()]
+        wavelengths = self.imaging.changed(bands=min(few, self.bands)).psf_wavelengths(self.scene.wavelengths)
+        nearest = (self.scene.wavelengths - wavelengths[:, None].to(self.scene.wavelengths)).abs().argmin(1)
+        seen, farthest = float(self.rays[nearest.cpu()].max()), float(max(recorded, default=0.0))
+        return farthest if farthest > UNLIKE * seen else 0.0
 
     @property
     def coarse(self) -> dict[str, Any]:
@@ -246,16 +261,17 @@ def _support(view: _View) -> Iterator[Ladder]:
         changes = {"psf_shape": shape} | ({"renormalise": True} if renormalise else {})
         return Level(f"{shape[0]} x {shape[1]} px" + (", rescaled" if renormalise else ""), changes, side)
 
-    largest = max(view.window)
-    levels = [level(side, renormalise=False) for side in WINDOWS if side < largest]
+    beside, off_by = view.few(window=False), BY_LINES
+    if not view.evaluator.by_lines(beside):
+        beside, off_by = view.few(window=False, bands=ROUND), 1.0
+    largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
+    sides = [side for side in WINDOWS if 2 * unseen < side < largest]
+    levels = [level(side, renormalise=False) for side in sides]
     top = Level(f"{view.window[0]} x {view.window[1]} px", {}, largest)
 
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
-    beside, off_by = view.few(window=False), BY_LINES
-    if not view.evaluator.by_lines(beside):
-        beside, off_by = view.few(window=False, bands=ROUND), 1.0
     levels = [*levels, top]
     yield Ladder("PSF support", levels, beside, alternatives=rescaled, off_by=off_by, from_top=view.evaluator.certain)
 

@@ -623,3 +623,22 @@ def test_colours_count_where_sharp_light_fills_the_well_and_blurred_light_does_n
         planner = Planner(camera, scene)
         for tolerance in (0.03, 0.01, 0.003):
             assert planner.plan(tolerance).measure(camera, scene) <= tolerance
+
+
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(n, marks=pytest.mark.slow) for n in range(4, 24))])
+def test_windows_hold_the_light_of_wavelengths_far_out_of_focus(seed: int) -> None:
+    """Of flint at the violet end: a few wavelengths, which are means of groups, see none of its blur."""
+    draw = random.Random(seed)
+    wavelengths = torch.linspace(380, draw.uniform(700, 800), draw.choice([7, 9, 12]), dtype=torch.float64) * nm
+    coefficients = torch.zeros(8, dtype=torch.float64)
+    coefficients[4:] = torch.tensor([draw.gauss(0, 0.3) for _ in range(4)])
+    glass = optics.PlanoConvexLens(draw.uniform(25, 45) * mm, glass="N-SF11")
+    aperture = optics.CircularAperture(draw.uniform(4, 6) * mm)
+    lens = optics.Lens(aperture, glass, optics.ZernikeDOE(coefficients), focus_distance=draw.uniform(1, 3))
+    light = torch.rand(1, len(wavelengths), 120, 40, generator=torch.Generator().manual_seed(seed))
+    scene = Scene.from_bands(light, wavelengths=wavelengths, depth=draw.uniform(1, 3))
+    camera = Camera(optics.Imaging(lens, pixel_pitch=draw.uniform(4, 9) * um))
+    with torch.no_grad():
+        planner, truth = Planner(camera, scene), camera(scene)
+        for tolerance in (0.1, 0.03, 0.01):
+            assert planner.plan(tolerance).measure(camera, scene, truth=truth) <= tolerance
