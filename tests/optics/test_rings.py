@@ -405,6 +405,22 @@ def test_a_window_cuts_a_psf_and_changes_nothing_else(seed: int) -> None:
     torch.testing.assert_close(small, part, rtol=0, atol=5e-6 * float(large.max()))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_transfer_functions_of_fast_optics_on_large_pixels(seed: int) -> None:
+    """Whose light has frequencies of many cycles per pixel: all of them are folded into those of the pixels."""
+    rng = random.Random(seed)
+    f_number, wavelengths = log_uniform(rng, 1.8, 6), [450 * nm, 650 * nm]
+    aperture = optics.AnnularAperture(25 * mm / f_number, obscuration=rng.choice([0.0, rng.uniform(0.1, 0.7)]))
+    lens = optics.Lens(aperture, optics.ThinLens(25 * mm), focus_distance=2.0)
+    asked = {"distances": rng.uniform(1.7, 2.4), "pixel_pitch": rng.uniform(4, 12) * um, "shape": (65, 65)}
+    psf = lens.psf(wavelengths, dtype=torch.float64, **asked)
+    frequencies = torch.linspace(0, 0.5, 40, dtype=torch.float64)
+    x = torch.arange(65, dtype=torch.float64) - 32
+    truth = torch.stack([psf.sum(dim) @ torch.cos(2 * math.pi * x[:, None] * frequencies) for dim in (-2, -1)], dim=2)
+    found = RADIAL.transfer(lens.query(wavelengths, **asked))(frequencies, (65, 65), [0, 1])
+    assert float((found - truth).abs().max()) < 4e-3
+
+
 @pytest.mark.parametrize("steps", [1, 17, 100, 1000])
 def test_the_refined_table_is_that_of_each_step(steps: int) -> None:
     """Of random rings, the outermost among them: it has the highest frequency."""

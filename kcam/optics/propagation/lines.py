@@ -33,7 +33,6 @@ _PASSED = 12  # half width of the low-pass along v, in samples at its Nyquist
 _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
 _SLOPE = 1e-4  # semi-apertures between which slopes are taken
-_FOLDS = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
 _TAPS = range(-1, 3)
 
 
@@ -93,10 +92,12 @@ class LineTransfer:
             light *= cut
             near, far = light.tensor_split([(self.length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
-            asked = (frequencies.to(light)[:, None] + _FOLDS.to(light)).flatten()
+            cutoff = 2 * a * query.pixel_pitch / (d * float(query.wavelengths.min()))
+            folds = sampling.folds(cutoff).to(light)
+            asked = (frequencies.to(light)[:, None] + folds).flatten()
             active = query.grid.active if query.grid.integrate else 0.0
             found = _between(table, asked * (2 * self.length * step)[:, None]) * torch.sinc(asked * active)
-            return found.unflatten(-1, (-1, len(_FOLDS))).sum(-1).permute(2, 0, 1, 3)
+            return found.unflatten(-1, (-1, len(folds))).sum(-1).permute(2, 0, 1, 3)
 
     @staticmethod
     def _inside(shape: tuple[int, int], step: Tensor, x: Tensor) -> Tensor:

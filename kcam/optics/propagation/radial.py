@@ -14,6 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from kcam.cache import ValueCache
 from kcam.optics.numerics import BesselJ0, lagrange
+from kcam.optics.propagation import sampling
 from kcam.optics.propagation.estimates import paraxial_error, trace
 from kcam.optics.propagation.question import Query, radial_phase, residual_path
 from kcam.optics.propagation.rings import fewer_nodes, panel_nodes, panel_orders
@@ -122,9 +123,10 @@ class RadialTransfer:
         end = min(self.light.shape[-1], math.ceil(math.hypot(*shape) / 2 / float(step.detach().min())) + 1)
         inside = _share_inside(shape, torch.arange(end, device=step.device) * step[:, None])
         table = (self.light[chosen, :, :end] * inside[:, None]) @ self.kernel[:end]  # (L, Z, K)
-        folds = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64, device=step.device)
+        cutoff = (self.kernel.shape[-1] - 1) / float(kappa.detach().min())
+        folds = sampling.folds(cutoff).to(step.device)
         along, across = frequencies[:, None, None] + folds[:, None], folds
-        radius = torch.sqrt(along**2 + across**2)  # (F, 3, 3)
+        radius = torch.sqrt(along**2 + across**2)  # (F, n, n)
         place = (kappa[:, None] * radius.flatten()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
         value = even_between(table, place).unflatten(-1, radius.shape)
         if self.active is not None:

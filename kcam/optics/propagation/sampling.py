@@ -15,6 +15,7 @@ KAPPA = 2.7  # pupil samples per cycle of the fastest fringe that reaches the wi
 WINDOW_MARGIN = 8  # pixels evaluated beyond the window, so that the pixel's sinc filter finds its light there
 _NYQUIST_SHARE = 0.95  # of the intensity's Nyquist pitch lambda d / 4a that the evaluation grid may use
 _CONTINUED = 64  # points over which the outermost value continues
+_MOST_FOLDS = 12  # to either side; light of f/1.8 at 550 nm reaches as far on pixels of 12 um
 MAX_PUPIL_SAMPLES = 8192
 """Across a pupil grid. A PSF takes up to 40 float64 numbers for each sample: 21 GB at this limit, 86 GB at twice it."""
 
@@ -89,3 +90,11 @@ def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0)
         box[:, -beyond - 1] += box[:, -beyond:].sum(1)
         box = box[:, beyond:-beyond]
     return torch.as_tensor(np.ascontiguousarray(box))
+
+
+def folds(cutoff: float) -> Tensor:
+    """Multiples of the pixels' frequency whose light is folded into that of the pixels, (n,): of light up to a cutoff,
+    2 a / (lambda d) [cycles per pixel], seen at frequencies up to the corner of the pixels' own, 0.71.
+    """
+    most = min(max(1, math.floor(cutoff + math.sqrt(0.5))), _MOST_FOLDS)
+    return torch.arange(-most, most + 1, dtype=torch.float64)
