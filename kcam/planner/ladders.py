@@ -187,7 +187,7 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     more, so that a few would not tell.
     """
     lens = view.imaging.lens
-    if not view.on_grid or not isinstance(lens, Lens) or lens.has_pixel_phase:
+    if not view.on_grid or not isinstance(lens, Lens) or lens.has_pixels:
         return
     own = view.imaging.accuracy.kappa or KAPPA
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in KAPPAS if kappa < own]
