@@ -287,10 +287,10 @@ class Lens(ElementStack):
         found = {row.kind: row.cost(query) * pixels.dtype.itemsize / 4}
         if query.has_pixels:
             maps = sum(map_.values.numel() for map_ in self.pixel_maps(query.wavelengths))
-            counts, parts = (sample_counts(query), 2) if self.has_pixel_phase else ({*sample_counts(query)}, 1)
+            counts, share = (sample_counts(query), 1.0) if query.has_pixel_phase else ({*sample_counts(query)}, 0.5)
             tau = float(query.tau.detach())
             warps = (0.0 if row.paraxial else warp_terms(count, tau) * count**2 for count in counts)
-            found["map"] = sum(maps + warp for warp in warps) * parts / 2
+            found["map"] = sum(maps + warp for warp in warps) * share
         return found
 
     def window(self, points: Points, wavelengths: Tensor, pixels: PixelGrid) -> tuple[int, int]:

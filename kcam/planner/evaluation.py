@@ -28,10 +28,10 @@ from kcam.optics.source import Defocus
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
 from kcam.planner.samples import Sample, samples_of
 from kcam.planner.spectra import LINEAR, Care, Spectra, linear
-from kcam.planner.survey import BEYOND, CLIPPING, TILE, Survey, survey
+from kcam.planner.survey import BEYOND, TILE, Survey, stops, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, Mosaic, Transmission
-from kcam.sensor.random_stage import Mean, RandomStage
+from kcam.sensor.random_stage import RandomStage
 
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
@@ -181,7 +181,7 @@ class Evaluator:
         """RMS of the light of each whole over that of what the full well leaves of it."""
         energies: dict[int, list[float]] = {}
         for owner, given in self._signals_by_owner:
-            clips = [index for index, stage in enumerate(self.camera) if isinstance(stage, CLIPPING)]
+            clips = [index for index, stage in enumerate(self.camera) if stops(stage)]
             signal = given[min(clips)][0].detach() if clips and min(clips) in given else torch.ones(1)
             whole = energies.setdefault(owner, [0.0, 0.0])
             for index, light in enumerate((signal, signal.clamp(max=1))):
@@ -329,9 +329,7 @@ class Evaluator:
     @functools.cached_property
     def _bottomless(self) -> Camera:
         """The raw's camera without what stops at the full well."""
-        kinds = (stage.stage if isinstance(stage, Mean) else stage for stage in self.raw_camera)
-        kept = [stage for stage, own in zip(self.raw_camera, kinds, strict=True) if not isinstance(own, CLIPPING)]
-        return Camera(*kept, context=self.raw_camera.context)
+        return Camera(*(s for s in self.raw_camera if not stops(s)), context=self.raw_camera.context)
 
     def _with(self, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Camera:
         if shortcuts:

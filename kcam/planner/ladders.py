@@ -57,7 +57,7 @@ ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 """By which two ways to the same picture differ."""
 
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
-UNRECORDED, UNLIKE = 1e-3, 1.2  # RMS of light of a wavelength, of that of all, of which windows may cut off what they
+UNRECORDED, FARTHER = 1e-3, 1.2  # RMS of light of a wavelength, of that of all, of which windows may cut off what they
 # like; how much farther rays may go at others than at those that tell of a window
 LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
@@ -127,7 +127,7 @@ class _View:
         wavelengths = self.imaging.changed(bands=min(few, self.bands)).psf_wavelengths(self.scene.wavelengths)
         nearest = (self.scene.wavelengths - wavelengths[:, None].to(self.scene.wavelengths)).abs().argmin(1)
         seen, farthest = float(self.rays[nearest.cpu()].max()), float(max(recorded, default=0.0))
-        return farthest if farthest > UNLIKE * seen else 0.0
+        return farthest if farthest > FARTHER * seen else 0.0
 
     @property
     def coarse(self) -> dict[str, Any]:

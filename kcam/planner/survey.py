@@ -137,15 +137,19 @@ def _recording(camera: Camera, scene: Scene) -> tuple[Tensor, bool]:
     weights = torch.eye(len(scene.wavelengths), dtype=torch.float64)
     clips = False
     for stage in camera:
-        own: Any = stage.stage if isinstance(stage, Mean) else stage
-        if isinstance(own, ColourFilter):
-            weights = own.contraction(scene.wavelengths).detach().double().cpu()
-            if own.is_tile:
-                weights = own.alpha().detach().double().cpu().mean((0, 1))[None] @ weights
-        elif isinstance(own, Exposure):
-            weights = weights * float(own.factor(camera.resolve(scene)).detach())
-        clips = clips or isinstance(own, CLIPPING)
+        if isinstance(stage, ColourFilter):
+            weights = stage.contraction(scene.wavelengths).detach().double().cpu()
+            if stage.is_tile:
+                weights = stage.alpha().detach().double().cpu().mean((0, 1))[None] @ weights
+        elif isinstance(stage, Exposure):
+            weights = weights * float(stage.factor(camera.resolve(scene)).detach())
+        clips = clips or stops(stage)
     return weights, clips
+
+
+def stops(stage: Any) -> bool:
+    """Whether a stage, or the random one whose mean it is, stops at the full well."""
+    return isinstance(stage.stage if isinstance(stage, Mean) else stage, CLIPPING)
 
 
 def _strips(rows: int, columns: int) -> Iterator[slice]:

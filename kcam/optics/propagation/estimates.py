@@ -155,7 +155,7 @@ def debye_error(query: Query, rays: Rays) -> float:
     light = _light(query, rays, r)
     phase = math.pi / rays.wavelength * a * r**2 / d**3
     aside = phase * a + r * a / d**2
-    if query.lens.round and not query.lens.has_pixel_phase:
+    if query.lens.round and not query.has_pixel_phase:
         aside = aside * np.minimum(1.0, aside + rays.phase)
     wrong = np.minimum(2.0, phase * r + r**2 / d**2 + aside)
     captured = min(1.0, 4 * math.pi * edge / _RADII * float((light * ring).sum()))

@@ -187,7 +187,7 @@ def _curve(
 
 
 def _curved(query: Query) -> bool:
-    return query.how.curved_kernel and query.lens.has_pixels and not query.paraxial
+    return query.how.curved_kernel and query.has_pixels and not query.paraxial
 
 
 def _fft_grid(query: Query, index: int) -> tuple[int, int, float]:
@@ -290,7 +290,7 @@ def _chirp_z_cost(query: Query) -> float:
 
 def _fft_cost(query: Query) -> float:
     # its grid scales with the wavelength, and each grid needs paths and weights of its own
-    total, setup = 0.0, _MAP_SETUP if query.lens.has_pixels else _SETUP
+    total, setup = 0.0, _MAP_SETUP if query.has_pixels else _SETUP
     for n, m in _sizes(query):
         length = max(2 * n, m)
         total += FFT_SLOWNESS * 10 * length**2 * math.log2(length) + setup * n**2

@@ -38,7 +38,7 @@ _TAPS = range(-1, 3)
 
 def lines(query: Query) -> LineTransfer | None:
     """About the transfer functions of a query; None off the axis, and beyond the paraxial model of maps of pixels."""
-    if query.points.positions is not None or (query.lens.has_pixels and not query.paraxial):
+    if query.points.positions is not None or (query.has_pixels and not query.paraxial):
         return None  # rows of pixels are curved in the image-side plane
     with torch.no_grad():
         return LineTransfer(query)
@@ -66,7 +66,7 @@ class LineTransfer:
         self.spacing, self.length = grid_spacing(count), fast_length(2 * count)  # |U|^2 has twice the frequencies of U
         nodes = grid_nodes(count).to(query.device)
         rows = [_rows(query, axis, count) for axis in range(2)]
-        self.maps = _Maps.of(query, rows, nodes) if query.lens.has_pixels else None
+        self.maps = _Maps.of(query, rows, nodes) if query.has_pixels else None
         self.axes = [_Rows.of(query, own, nodes, axis, self.maps) for axis, own in enumerate(rows)]
         self.spreads: dict[int, Tensor] = {}
 
@@ -125,11 +125,11 @@ class LineTransfer:
 def _rows(query: Query, axis: int, samples: int) -> Tensor:
     """Where rows along x (axis 0), or columns along y (axis 1), cross the pupil, (R,) in semi-apertures."""
     count, every = max(_ROWS, 2 * math.ceil(samples / (2 * _PER_ROW))), 1
-    if query.lens.has_pixels:  # as many as tell what falls into the window, and of these some
+    if query.has_pixels:  # as many as tell what falls into the window, and of these some
         count = max(_SAMPLED, math.ceil(2 * _fringes(query, axis) / float(query.wavelengths.min())))
         every = count // _SAMPLED
     rows = (torch.arange(count, dtype=torch.float64, device=query.device) + 0.5) * (2 / count) - 1
-    return rows[count // 2 :] if query.even and not query.lens.has_pixels else rows[every // 2 :: every]
+    return rows[count // 2 :] if query.even and not query.has_pixels else rows[every // 2 :: every]
 
 
 def _fringes(query: Query, axis: int) -> float:

@@ -244,7 +244,7 @@ class Seen:
 
     def _with_maps(self, *counts: int) -> tuple[int, int, int]:
         """The grid is everywhere at least as fine as the true plane's, whose samples hold all that the grid must."""
-        if not self.query.lens.has_pixels:
+        if not self.query.has_pixels:
             return counts[0], counts[1], 0
         with torch.no_grad():
             grid = self.grid((_LOOK, _LOOK))

@@ -59,9 +59,7 @@ def radial_psf(query: Query) -> Tensor:
     for index, wavelength in enumerate(query.wavelengths.tolist()):
         arguments = (light[index], scales[index], query, wavelength)
         image = (
-            checkpoint(_ring_image, *arguments, use_reentrant=False)
-            if light.requires_grad
-            else _ring_image(*arguments)
+            checkpoint(_ring_image, *arguments, use_reentrant=False) if light.requires_grad else _ring_image(*arguments)
         )
         factor = (a * query.pixel_pitch / (wavelengths[index] * d)) ** 2 / energy
         bands.append(image * factor[:, None, None].to(query.dtype))

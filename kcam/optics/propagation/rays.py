@@ -76,7 +76,7 @@ def _error(query: Query) -> float:
 
 
 def _needs_smooth_path(query: Query) -> str | None:
-    if query.lens.has_pixel_phase:
+    if query.has_pixel_phase:
         return "has no rays for a DOE of flat pixels, whose slope is 0 or infinite; use propagator='nonparaxial'."
     return None
 

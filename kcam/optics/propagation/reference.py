@@ -77,7 +77,7 @@ def _refined(query: Query) -> Query:
 
 
 def _evaluate(query: Query, *, doubling: int) -> Tensor:
-    if query.lens.round and not query.lens.has_pixels:
+    if query.lens.round and not query.has_pixels:
         return polar_psf(query, density=doubling)
     how = query.how
     query = query.sampled(kappa=doubling * how.kappa, cells_per_sample=doubling * how.cells_per_sample)
@@ -98,7 +98,7 @@ def convergence(query: Query) -> Convergence:
 
 
 def _limit(query: Query) -> float:
-    return PIXELS_LIMIT if query.lens.has_pixels else SMOOTH_LIMIT
+    return PIXELS_LIMIT if query.has_pixels else SMOOTH_LIMIT
 
 
 def _closed_form_error(spots: Query) -> float:

@@ -103,8 +103,9 @@ def fewer_nodes(values: Tensor, nodes: Tensor, *, frequency: float) -> tuple[Ten
     Returns:   values (..., m) and nodes (m,); as they were where m is no less.
     """
     low = float(nodes.detach().min())
-    parts = max(1, math.ceil(frequency * (1 - low) / 2 / _TURNS))
-    turns = frequency * (1 - low) / 2 / parts
+    whole = frequency * (1 - low) / 2
+    parts = max(1, math.ceil(whole / _TURNS))
+    turns = whole / parts
     count = math.ceil(turns + min(48, 12 + 8 * turns ** (1 / 3)))
     if 1.5 * count * parts > nodes.numel() or nodes.requires_grad:
         return values, nodes
@@ -118,8 +119,8 @@ def fewer_nodes(values: Tensor, nodes: Tensor, *, frequency: float) -> tuple[Ten
         chosen = (part == own).nonzero()[:, 0]
         fine = np.polynomial.legendre.legvander((2 * (inside[chosen] - own) - 1).cpu().numpy(), count - 1)
         projected.append(values[..., chosen] @ torch.as_tensor(np.ascontiguousarray(fine)).to(nodes) @ back)
-    ends = torch.arange(parts, dtype=nodes.dtype, device=nodes.device)[:, None]
-    fewer = (torch.as_tensor(places).to(nodes) + 1) / 2 + ends
+    starts = torch.arange(parts, dtype=nodes.dtype, device=nodes.device)[:, None]
+    fewer = (torch.as_tensor(places).to(nodes) + 1) / 2 + starts
     return torch.cat(projected, dim=-1), low + (1 - low) / parts * fewer.flatten()
 
 

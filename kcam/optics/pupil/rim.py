@@ -106,9 +106,9 @@ def disc_weights(count: int, *, spacing: float, radius: float = 1.0) -> Tensor:
     quadrant = torch.zeros(half, half, dtype=torch.float64)
     for first in range(0, half, _NODES_AT_ONCE):  # of cells 25 times as many as nodes only a few rows are held
         last = min(first + _NODES_AT_ONCE, half)
-        start, stop = _near_rim(first, last, radius / spacing)
+        start, stop = (min(end, half) for end in _near_rim(first, last, radius / spacing))
         quadrant[first:last, :start] = 1.0
-        if start >= (stop := min(stop, half)):
+        if start >= stop:
             continue
         rows, columns = (edges[a * FINE : (b - 1) * FINE + taps + 1] for a, b in ((first, last), (start, stop)))
         area = disc_area_below(np.abs(rows[:, None]), np.abs(columns)) * np.sign(rows[:, None]) * np.sign(columns)
