@@ -19,6 +19,7 @@ Left to whoever does so: changing kcam's functions and constants themselves.
 
 from __future__ import annotations
 
+import operator
 import types
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -34,6 +35,7 @@ _PLAIN = {type(None), bool, int, str, bytes, torch.dtype, torch.device, torch.la
 _CONTAINERS = {tuple, list, dict, OrderedDict, set, frozenset, torch.Size}
 _CODE = (types.FunctionType, property, classmethod, staticmethod)
 _IN_PYTHON = 1 << 9  # the flag of classes that are not compiled
+_DEFINED: dict[type, tuple[Any, tuple[Any, ...]]] = {}  # by `_members`
 _INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
@@ -123,9 +125,16 @@ def _of_classes(kind: type) -> tuple[list[Any], list[Any]]:
 
 
 def _members(cls: type) -> tuple[Any, ...]:
-    """What a class of ours defines; not what Python writes beside it when asked: annotations, or names of slots."""
-    defined = vars(cls).items()
-    return tuple(value for name, value in defined if not name.startswith("__") or isinstance(value, _CODE))
+    """What a class of ours defines; not what Python writes beside it when asked: annotations, or names of slots.
+
+    It is kept while the class holds the very same objects: each key asks all classes of a lens.
+    """
+    own = tuple(vars(cls)), tuple(vars(cls).values())
+    known = _DEFINED.get(cls)
+    if known is None or own[0] != known[0][0] or not all(map(operator.is_, own[1], known[0][1])):
+        some = (value for name, value in zip(*own, strict=True) if not name.startswith("__") or isinstance(value, _CODE))
+        _DEFINED[cls] = known = own, tuple(some)
+    return known[1]
 
 
 def _closed_over(function: types.FunctionType) -> list[Any]:

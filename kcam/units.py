@@ -179,19 +179,17 @@ def check_distances(distance: Tensor | float, *, name: str = "distance") -> Tens
     ValueError: distance 0 is not a distance in front of the lens: expected metres > 0, ...
     """
     values = as_numbers(distance, name=name, expected="a number of metres such as 2.0")
+    if bool((values >= LEAST_DISTANCE).all()):
+        return values
     bad = ~(values > 0)
     if bad.any():
         raise ValueError(
             f"{name} {values[bad].flatten()[0].item():g} is not a distance in front of the lens: expected metres > 0, "
             "or float('inf') for infinity."
         )
-    near = values < LEAST_DISTANCE
-    if near.any():
-        raise ValueError(
-            f"{name} {values[near].flatten()[0].item():g} is too near: expected metres >= {LEAST_DISTANCE:g}, such as "
-            "2.0."
-        )
-    return values
+    raise ValueError(
+        f"{name} {values.min().item():g} is too near: expected metres >= {LEAST_DISTANCE:g}, such as 2.0."
+    )
 
 
 def warn_of_millimetres(depth: Tensor | float) -> None:

@@ -166,25 +166,26 @@ class Imaging(Stage):
 
         Of layers that are changed here no warning says that they are few: a plan has weighed what they cost.
         """
-        if arguments.keys() <= _SHORTCUTS:
+        if arguments.keys() <= _SETTINGS:
             changed = self._with(replace(self.accuracy, **arguments))
+            if not arguments.keys() <= _SHORTCUTS:
+                changed._check_recipe()
         else:
             changed = Imaging(**(self.configuration() | arguments))
-        changed._warns = self._warns and "layers" not in arguments
-        changed._traced_cache, changed._window_cache = self._traced_cache, self._window_cache
-        changed._reach, changed.known = self._reach, self.known
+        shared = ["_traced_cache", "_window_cache", "_reach", "known"]
         if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
-            changed._field_cache = self._field_cache
+            shared.append("_field_cache")
+        vars(changed).update({name: vars(self)[name] for name in shared})  # past torch's checks, at each step of a plan
+        changed._warns = self._warns and "layers" not in arguments
         return changed
 
     def _with(self, accuracy: Accuracy) -> Imaging:
-        """The same stage with shortcuts that no recipe is asked about, which has kept nothing."""
+        """The same stage with another accuracy, which has kept nothing."""
         changed = Imaging.__new__(Imaging)
         super(Imaging, changed).__init__()
-        vars(changed).update({name: value for name, value in vars(self).items() if name not in vars(changed)})
-        vars(changed)["_modules"] = dict(vars(self)["_modules"])
-        for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache"):
-            setattr(changed, name, ValueCache())
+        own = {name: value for name, value in vars(self).items() if name not in vars(changed)}
+        own |= {name: ValueCache() for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache")}
+        vars(changed).update(own, _modules=dict(vars(self)["_modules"]))
         changed.accuracy = accuracy
         return changed
 

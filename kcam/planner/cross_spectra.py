@@ -27,12 +27,14 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
     if dark:
         found = scipy.fft.rfftn(planes.cpu().numpy(), s=(2 * height, 2 * width), axes=(-2, -1), norm="ortho")
         found[..., 1:width] *= math.sqrt(2)  # each stands for one to the left of the middle, too
-        spectrum = torch.view_as_real(torch.as_tensor(found))
     else:
-        spectrum = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))[..., None]
+        found = scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho")
     order, counts = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
-    parts = spectrum.flatten(1, 2)[:, order].split(counts, dim=1)
-    return torch.stack([part.flatten(1) @ part.flatten(1).T for part in parts]).double().unflatten(0, (2, -1))
+    spectrum = torch.as_tensor(found).flatten(1).index_select(1, order)
+    if dark:
+        spectrum, counts = torch.view_as_real(spectrum).flatten(1), [2 * count for count in counts]
+    parts = spectrum.split(counts, dim=1)
+    return torch.stack([part @ part.T for part in parts]).double().unflatten(0, (2, -1))
 
 
 @functools.lru_cache(maxsize=8)

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
+from kcam.optics.numerics import cubic_weights
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.source import Points
-from kcam.optics.wavelengths import few_wavelengths
 from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
@@ -100,24 +100,21 @@ class Transfers:
         few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
         return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
 
-    @functools.cached_property
-    def _every_line(self) -> Tensor:
-        """The same, and those between whose line spreads others lie."""
-        if len(self.wavelengths) <= _BETWEEN_LINES or not self.deep:
-            return self._every
-        return torch.cat([self._every, few_wavelengths(self.wavelengths, _BETWEEN_LINES, interpolate=True)[0]])
-
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
         """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths
-        (L,), (L, G): of line spreads of a deep scene, of which each takes its time, those of all bands may lie between
-        some.
+        (L,), (L, G). Of line spreads, of which each takes its time, those of all bands of a deep scene may lie between
+        some, and those of many groups between all bands', which these are compared with.
         """
         groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
         shares = imaging.shares(wavelengths, deep=self.deep)
-        many = way is Way.BETWEEN_LINES and self.deep and shares is None and len(groups) > _BETWEEN_LINES
-        if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
-            groups, shares = few_wavelengths(wavelengths, _BETWEEN_LINES, interpolate=True)
-        return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
+        grey, own = len(wavelengths) <= len(self.few), None
+        if way is Way.BETWEEN_LINES and self.deep and shares is None and len(groups) > _BETWEEN_LINES:
+            own = _ends_and_between(wavelengths, _BETWEEN_LINES)
+        elif way is Way.LINES and shares is not None and len(groups) > GROUPS:
+            own = wavelengths
+        if own is not None and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
+            groups, shares = own, shares @ _cubics(own, groups) if shares is not None else _cubics(own, wavelengths)
+        return self._slices(imaging, vergences, groups, way, grey=grey), shares
 
     def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
         if not imaging.accuracy.blur:
@@ -224,7 +221,7 @@ class Transfers:
 
     def lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Table | None:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
-        window, some = self.window(imaging, vergences), torch.cat([self._every_line, wavelengths]).unique()
+        window, some = self.window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
         key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
             query, like = self._query(imaging, vergences, some, window), key[1:3]
@@ -233,6 +230,22 @@ class Transfers:
             lines = None if query is None else self._line_rows[like].lines(query)
             self._tables[key] = None if lines is None else Table(some.tolist(), lines)
         return self._tables[key]
+
+
+def _ends_and_between(wavelengths: Tensor, count: int) -> Tensor:
+    """The outermost of the wavelengths (L,), and so many less two of those between that 1/wavelength goes in even
+    steps, nearly.
+    """
+    numbers = 1 / wavelengths
+    even = torch.linspace(float(numbers.min()), float(numbers.max()), count).to(numbers)
+    return wavelengths[(numbers - even[:, None]).abs().argmin(1).unique()]
+
+
+def _cubics(nodes: Tensor, wavelengths: Tensor) -> Tensor:
+    """Weights (L, n) of cubics in 1/wavelength through the four nearest of the nodes (n,)."""
+    numbers, order = (1e-6 / nodes).sort()
+    weights = cubic_weights(numbers, 1e-6 / wavelengths)
+    return weights[:, order.argsort()]
 
 
 def _inside(query: Query) -> bool:

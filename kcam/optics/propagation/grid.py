@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -281,11 +282,13 @@ def matrix_cost(query: Query) -> float:
 
 
 def _chirp_z_cost(query: Query) -> float:
-    total = 0.0
-    for n, m in _sizes(query):
-        length = fast_length(n + m)
-        total += FFT_SLOWNESS * 10 * (n + m) * length * math.log2(length)
-    return query.vergences.numel() * total
+    return query.vergences.numel() * sum(_chirp_z_operations(n + m) for n, m in _sizes(query))
+
+
+@functools.lru_cache(maxsize=1024)
+def _chirp_z_operations(points: int) -> float:
+    length = fast_length(points)
+    return FFT_SLOWNESS * 10 * points * length * math.log2(length)
 
 
 def _fft_cost(query: Query) -> float:

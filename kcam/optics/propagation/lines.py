@@ -298,11 +298,11 @@ def _rim(query: Query, rows: Tensor, nodes: Tensor) -> Tensor:
 
 def _between(table: Tensor, place: Tensor) -> Tensor:
     """What is known at 0, 1, ..., (L, 2, Z, N), conjugate below 0, at places (L, F), by cubics; beyond it is 0."""
-    low = place.floor()
-    found = torch.zeros((), dtype=table.dtype, device=table.device)
-    for tap, weight in zip(_TAPS, lagrange(place - low, taps=_TAPS), strict=True):
-        index = (low.long() + tap)[:, None, None]
-        at = index.abs().clamp(max=table.shape[-1] - 1).expand(*table.shape[:-1], -1)
-        taken = torch.where(index < 0, table.gather(-1, at).conj(), table.gather(-1, at))
-        found = found + taken * (weight[:, None, None] * (index.abs() < table.shape[-1]))
-    return found
+    far = place.abs().clamp(max=table.shape[-1] + 1)
+    low = far.floor()
+    known = torch.cat([table[..., 1:2].conj(), table, table.new_zeros(*table.shape[:-1], len(_TAPS))], dim=-1)
+    index = low.long()[:, None, None, :, None].expand(*table.shape[:-1], -1, len(_TAPS))
+    around = known.unfold(-1, len(_TAPS), 1).gather(-2, index)  # (L, 2, Z, F, 4)
+    weights = torch.stack(lagrange(far - low, taps=_TAPS), dim=-1).to(table.dtype)
+    found = (around * weights[:, None, None]).sum(-1)
+    return torch.where((place < 0)[:, None, None], found.conj(), found)

@@ -164,9 +164,9 @@ class Query:
             )
         return per_pixel, math.ceil(per_pixel * self.half_pixels)
 
-    @property
+    @functools.cached_property
     def points_per_axis(self) -> list[int]:
-        """On each axis, at which the intensity of each wavelength is evaluated."""
+        """On each axis, at which the intensity of each wavelength is evaluated; kept, because each row's price asks."""
         return [2 * self.evaluation_grid(wavelength)[1] + 1 for wavelength in self.wavelengths.tolist()]
 
     @functools.cached_property
