@@ -204,10 +204,11 @@ class ValueCache:
             return build()
         if any(map(recorded, tensors)):
             return build()
+        bits = [*map(_bits, tensors)]
         for kept in self._kept:
-            if kept[0] == key and all(map(_same_bits, kept[1], tensors)):
+            if kept[0] == key and all(map(torch.equal, kept[1], bits)):
                 return kept[2]  # type: ignore[no-any-return]
-        before = tuple(tensor.detach().clone() for tensor in tensors)
+        before = tuple(own.clone() for own in bits)
         value = build()
         if not has_derivative(value):
             self._kept = ((key, before, value), *self._kept)[: self.entries]

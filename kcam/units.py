@@ -242,6 +242,7 @@ def check_positive(value: Tensor | float, *, name: str, unit: str = "m") -> None
     Traceback (most recent call last):
     ValueError: sensor_distance must be finite and > 0 m, got -1.
     """
-    number = float(as_numbers(value, name=name, expected=f"a number > 0 {unit}").detach().min())
+    plain = type(value) in (float, int)  # at every use of a lens
+    number = value if plain else float(as_numbers(value, name=name, expected=f"a number > 0 {unit}").detach().min())
     if not (number > 0 and math.isfinite(number)):
         raise ValueError(f"{name} must be finite and > 0 {unit}, got {number:g}.")

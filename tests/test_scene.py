@@ -347,6 +347,26 @@ class TestLowRank:
         u, s, v = torch.linalg.svd(cube, full_matrices=False)
         assert ((u[:, :2] * s[:2]) @ v[:2]).min() < -0.01, "the plain truncation is negative here"
 
+    @pytest.mark.parametrize("seed", range(8))
+    def test_factors_that_dip_below_zero(self, seed: int, generator) -> None:
+        """As far as a scene lets pass: what is left of them is light, and close."""
+        signs = torch.where(torch.rand(4, 1, generator=generator.manual_seed(seed)) > 0.3, 1.0, -1.0)
+        spectra = torch.rand(4, 28, generator=generator) * signs
+        planes = torch.rand(1, 4, 12, 13, generator=generator)
+        planes[..., :4, :4] *= 1e-3  # dark, where a dip is all there is
+        spectra[0], planes[:, 0] = 1, 0
+        planes[:, 0] = (-torch.einsum("bkhw,kl->blhw", planes, spectra).amin(1)).clamp(min=0)
+        brightest = torch.einsum("bkhw,kl->blhw", planes, spectra).max()
+        planes[:, 0] -= 9e-4 * brightest * (torch.rand(1, 12, 13, generator=generator) < 0.3)
+        scene = Scene(planes, wavelengths=wavelength_grid(), depth=1.0, spectra=spectra)
+        assert scene.bands().min() < 0
+        errors = []
+        for rank in (1, 2, 3, 4):
+            low = scene.low_rank(rank)
+            assert low.bands().min() > -1e-6 * brightest
+            errors.append(self.error(low, scene))
+        assert errors == sorted(errors, reverse=True) and errors[-1] < 0.05
+
     def test_gradients_and_bad_input(self) -> None:
         image = picture(3, 6, 7, dtype=torch.float64).requires_grad_()
         Scene.from_rgb(image).low_rank(2).bands().square().sum().backward()

@@ -40,7 +40,7 @@ from kcam.units import check_distances, check_pixel_pitch, wavelength_grid
 
 _DEFAULT = Accuracy()
 _SETTINGS = _DEFAULT.settings().keys()
-_SHORTCUTS = _SETTINGS - {field.name for field in fields(Recipe)}
+_RECIPE = {field.name for field in fields(Recipe)}
 _FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
 _TRACED = 4  # lenses, at some vergences and wavelengths, whose pupils are kept
 
@@ -168,8 +168,8 @@ class Imaging(Stage):
         """
         if arguments.keys() <= _SETTINGS:
             changed = self._with(replace(self.accuracy, **arguments))
-            if not arguments.keys() <= _SHORTCUTS:
-                changed._check_recipe()
+            if arguments.keys() & _RECIPE:
+                changed._check_recipe(known=True)
         else:
             changed = Imaging(**(self.configuration() | arguments))
         shared = ["_traced_cache", "_window_cache", "_reach", "known"]
@@ -208,9 +208,14 @@ class Imaging(Stage):
             )
         return own
 
-    def _check_recipe(self) -> None:
-        """What asks for a method that does not exist, or for one where nothing is computed, is refused at once."""
+    def _check_recipe(self, *, known: bool = False) -> None:
+        """What asks for a method that does not exist, or for one where nothing is computed, is refused at once.
+
+        known: the lens with another recipe was asked already, and a propagator and kappa alone tell what they are.
+        """
         if isinstance(self.lens, Lens) and not self.field:
+            if known and self.accuracy.method is None and self.accuracy.samples is None:
+                return
             pixels = self.pixels(self.accuracy.psf_shape or (1, 1), torch.empty(0))
             query = self.lens.question(Points(torch.zeros(1)), wavelength_grid([550e-9]), pixels, self.accuracy)
             if self.accuracy.method is not None:

@@ -33,8 +33,11 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
     spectrum = torch.as_tensor(found).flatten(1).index_select(1, order)
     if dark:
         spectrum, counts = torch.view_as_real(spectrum).flatten(1), [2 * count for count in counts]
-    parts = spectrum.split(counts, dim=1)
-    return torch.stack([part @ part.T for part in parts]).double().unflatten(0, (2, -1))
+    found = torch.zeros(len(counts), len(planes), len(planes), dtype=torch.float64)
+    filled = [ring for ring, count in enumerate(counts) if count]  # the widest waves of a small picture are few
+    parts = spectrum.split([counts[ring] for ring in filled], dim=1)
+    found[filled] = torch.stack([part @ part.T for part in parts]).double()
+    return found.unflatten(0, (2, -1))
 
 
 @functools.lru_cache(maxsize=8)

@@ -78,7 +78,7 @@ def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[La
     evaluator.look(view.beside | view.coarse)
     found = [ladder for make in LADDERS for ladder in make(view)]
     for ladder in found:
-        ladder.least = max(ladder.least, ROUNDED[imaging.working(scene).dtype])
+        ladder.least = max(ladder.least, ROUNDED[view.dtype])
     return found
 
 
@@ -88,6 +88,7 @@ class _View:
     def __init__(self, evaluator: Evaluator, imaging: Imaging, scene: Scene, *, one: bool) -> None:
         self.imaging, self.scene, self.one = imaging, scene, one
         planes, self.vergences, _ = evaluator.laid_out(imaging, scene)
+        self.dtype = planes.dtype
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         self.layers = len(imaging.vergences(scene, depth)) if depth.numel() else 1
         self.bands = min(imaging.accuracy.bands or len(scene.wavelengths), len(scene.wavelengths))
@@ -232,7 +233,7 @@ def _rank(view: _View) -> Iterator[Ladder]:
     own = view.scene.coefficients.shape[1]
     if view.scene.spectra is None and own > 1:
         levels = [Level(f"rank {rank}", {"rank": rank}, rank) for rank in RANKS if rank < own]
-        least = CANCELLED[view.imaging.working(view.scene).dtype]
+        least = CANCELLED[view.dtype]
         yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False}, doubtful=True, least=least)
 
 

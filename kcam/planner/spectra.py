@@ -302,7 +302,7 @@ class Spectra:
         """Times the error without occlusion that there is with it, (B,): more of a few lights or patches of light, and
         where something near is seen through.
         """
-        defocus = self.imaging.defocus(self.wavelengths)
+        defocus = self.optics.defocus
         found = torch.where(self.few_lights, _HIDDEN_LIGHTS, _HIDDEN).double()
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)

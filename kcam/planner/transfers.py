@@ -20,7 +20,7 @@ from kcam.optics.imaging import is_deep
 from kcam.optics.numerics import cubic_weights
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
-from kcam.optics.source import Points
+from kcam.optics.source import Defocus, Points
 from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
@@ -88,6 +88,11 @@ class Transfers:
         return self._stages[key]
 
     @functools.cached_property
+    def defocus(self) -> Defocus:
+        """How far light is spread."""
+        return self.imaging.defocus(self.wavelengths)
+
+    @functools.cached_property
     def few(self) -> Tensor:
         """Wavelengths that tell of others."""
         return self.stage({"bands": FEW_BANDS}).psf_wavelengths(self.wavelengths)
@@ -98,7 +103,7 @@ class Transfers:
         own, deep = self.wavelengths, self.deep
         few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
         few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
-        return torch.cat([self.imaging.changed(**one).psf_wavelengths(own, deep=deep) for one in few]).unique()
+        return torch.cat([self.stage(one).psf_wavelengths(own, deep=deep) for one in few]).unique()
 
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
         """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths

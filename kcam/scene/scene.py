@@ -22,6 +22,7 @@ from kcam.scene.picture import read_picture
 from kcam.scene.resizing import fitted, target_shape
 from kcam.units import LEAST_DISTANCE, check_distances, check_positive, warn_of_millimetres, wavelength_grid
 
+_BLOCK = 2**12  # pixels whose light in all bands is formed at once
 ROUGH = 1 / 255
 """Error of the way from sRGB to spectra and back from which on `Scene.from_rgb` warns of too few bands."""
 
@@ -359,13 +360,14 @@ class Scene:
         with full_precision(self.device):
             onto = directions if spectra is None else spectra @ directions
             new = torch.einsum("bkhw,kr->brhw", planes, onto)
-            share = torch.ones_like(new[:, 0])
+            brightness = new[:, 0].clamp(min=0)  # of a factored scene that dips below zero, too
+            share = torch.ones_like(brightness)
             for direction in directions:
-                first = new[:, 0] * direction[0]
+                first = brightness * direction[0]
                 rest = torch.einsum("brhw,r->bhw", new[:, 1:], direction[1:])
                 most = -first / rest.clamp(max=-torch.finfo(rest.dtype).tiny)  # no NaN gradient where rest is 0
                 share = torch.where(first + share * rest < 0, most, share)
-        new = torch.cat([new[:, :1], new[:, 1:] * share[:, None]], dim=1)
+        new = torch.cat([brightness[:, None], new[:, 1:] * share[:, None]], dim=1)
         return replace(self, coefficients=new, spectra=directions.T)
 
     def crop(self, *, top: int, left: int, height: int, width: int) -> Scene:
@@ -418,7 +420,7 @@ def _product_range(planes: Tensor, spectra: Tensor, low: float, high: float) -> 
     lowest, highest = (value.item() for value in spectra.aminmax())
     if (low >= 0 and lowest >= 0) or not np.isfinite([low, high, lowest, highest]).all():
         return low * lowest, high * highest
-    ranges = [torch.einsum("bkhw,k->bhw", planes, spectrum).aminmax() for spectrum in spectra.T]
+    ranges = [(spectra.T @ block).aminmax() for item in planes.flatten(2) for block in item.split(_BLOCK, 1)]
     return min(pair.min.item() for pair in ranges), max(pair.max.item() for pair in ranges)
 
 

@@ -272,10 +272,10 @@ def residual_path(query: Query, pupil: Pupil, elements: Sequence[Element] | None
     if not query.paraxial:
         coefficients.append(ones)
         maps.append(pupil.beyond_paraxial(1 / query.sensor_distance))
-        for index, vergence in enumerate(query.vergences):
-            if differentiated(vergence) or float(vergence) != 0:
-                coefficients.append(ones * (torch.arange(distances, device=query.device) == index))
-                maps.append(pupil.beyond_paraxial(vergence))
+        every = torch.arange(distances, device=query.device)
+        near = every if differentiated(query.vergences) else every[query.vergences != 0]
+        coefficients += (ones * (every == near[:, None, None])).unbind(0)
+        maps += pupil.beyond_paraxial(query.vergences[near][(..., *[None] * pupil.rho2.ndim)]).unbind(0)
     for element in query.lens.elements if elements is None else elements:
         for coefficient, term in element.terms(pupil, wavelengths):
             coefficients.append(coefficient[:, None] * ones)

@@ -11,6 +11,7 @@ edges would be curved there, are sampled in the true plane; `CurvedTransform` th
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -37,10 +38,10 @@ class Pupil:
     paraxial: bool
     round: bool = False
 
-    @property
+    @functools.cached_property
     def rho2(self) -> Tensor:
         """Squared normalised radius; kept squared, because sqrt has no gradient at 0."""
-        return self.x**2 + self.y**2
+        return self.x.square() + self.y.square()
 
     @property
     def tau(self) -> Tensor:
@@ -61,8 +62,8 @@ class Pupil:
         if self.paraxial:
             return torch.zeros_like(self.rho2)
         r2 = self.rho2 * self.semi_aperture**2
-        q = torch.sqrt(1 + vergence**2 * r2)
-        return -(vergence**3) * r2**2 / (2 * (1 + q) ** 2)
+        q = torch.sqrt(1 + vergence.square() * r2)
+        return -(vergence**3) / 2 * (r2 / (1 + q)).square()
 
 
 def pupil_tau(semi_aperture: Tensor, sensor_distance: Tensor, *, paraxial: bool) -> Tensor:
