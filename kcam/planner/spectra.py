@@ -65,6 +65,7 @@ _MOST = 0.9  # of the light, that a window must hold through which it is looked 
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _BETWEEN_LAYERS = 4  # times as many layers as there are in a setting, between whose transfer functions its own lie
+_SAME_LAYER = 1e-6  # of the range of depth
 _UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
 _WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
 
@@ -368,9 +369,8 @@ class Spectra:
         """
         imaging, scene = self.optics.stage(changes), self.scene
         vergences = layered.vergences if between is None else between[0]
-        if between is not None and _BETWEEN_LAYERS * len(vergences) <= len(layered.vergences):
-            among = cubic_weights(layered.vergences.cpu(), vergences)
-            vergences, between = layered.vergences, (vergences, between[1] @ among)
+        if between is not None and _among(vergences, every := layered.vergences.cpu()):
+            vergences, between = layered.vergences, (vergences, between[1] @ cubic_weights(every, vergences))
         transfer, shares = self.optics.of(imaging, vergences, scene.wavelengths, way)
         if between is not None:
             transfer = torch.einsum("zy,ygof->zgof", between[1].to(transfer.dtype), transfer)
@@ -389,6 +389,14 @@ class Spectra:
 
 def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
     return any(changes.get(name) != against.get(name) for name in names)
+
+
+def _among(vergences: Tensor, others: Tensor) -> bool:
+    """Whether layers are some of others, or few enough to lie between these, so that they need nothing of their own."""
+    if _BETWEEN_LAYERS * len(vergences) <= len(others):
+        return True
+    apart = (vergences[:, None] - others).abs().amin(1)
+    return bool((apart <= _SAME_LAYER * (others.max() - others.min())).all())
 
 
 def _compressed(scene: Scene) -> Scene:

@@ -26,8 +26,8 @@ from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
 
 _BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
-GROUPS = 7  # of bands, up to which errors are told so: 0.9 to 1.15 times what they are by each band's own line spread
-# (5 to 95 % of 36 deep scenes behind maps)
+GROUPS = 7  # PSFs, up to whose number errors are told so: 0.9 to 1.15 times what they are by each band's own line
+# spread (5 to 95 % of 36 deep scenes behind maps), and 0.9 to 1.3 of PSFs between others, of which 6 are told worst
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
@@ -107,13 +107,13 @@ class Transfers:
 
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
         """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths
-        (L,), (L, G). Of line spreads, of which each takes its time, those of all bands of a deep scene may lie between
-        some, and those of many groups between all bands', which these are compared with.
+        (L,), (L, G). Of line spreads, of which each takes its time, those of all bands may lie between some, and those
+        of many groups between all bands', which these are compared with.
         """
         groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
         shares = imaging.shares(wavelengths, deep=self.deep)
         grey, own = len(wavelengths) <= len(self.few), None
-        if way is Way.BETWEEN_LINES and self.deep and shares is None and len(groups) > _BETWEEN_LINES:
+        if way is Way.BETWEEN_LINES and shares is None and len(groups) > _BETWEEN_LINES:
             own = _ends_and_between(wavelengths, _BETWEEN_LINES)
         elif way is Way.LINES and shares is not None and len(groups) > GROUPS:
             own = wavelengths
