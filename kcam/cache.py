@@ -35,7 +35,7 @@ _PLAIN = {type(None), bool, int, str, bytes, torch.dtype, torch.device, torch.la
 _CONTAINERS = {tuple, list, dict, OrderedDict, set, frozenset, torch.Size}
 _CODE = (types.FunctionType, property, classmethod, staticmethod)
 _IN_PYTHON = 1 << 9  # the flag of classes that are not compiled
-_DEFINED: dict[type, tuple[Any, tuple[Any, ...]]] = {}  # by `_members`
+_DEFINED: dict[type, tuple[tuple[Any, ...], ...]] = {}  # by `_members`
 _INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
@@ -129,12 +129,13 @@ def _members(cls: type) -> tuple[Any, ...]:
 
     It is kept while the class holds the very same objects: each key asks all classes of a lens.
     """
-    own = tuple(vars(cls)), tuple(vars(cls).values())
+    names, values = tuple(vars(cls)), tuple(vars(cls).values())
     known = _DEFINED.get(cls)
-    if known is None or own[0] != known[0][0] or not all(map(operator.is_, own[1], known[0][1])):
-        some = (value for name, value in zip(*own, strict=True) if not name.startswith("__") or isinstance(value, _CODE))
-        _DEFINED[cls] = known = own, tuple(some)
-    return known[1]
+    if known is None or names != known[0] or not all(map(operator.is_, values, known[1])):
+        pairs = zip(names, values, strict=True)
+        some = (value for name, value in pairs if not name.startswith("__") or isinstance(value, _CODE))
+        _DEFINED[cls] = known = names, values, tuple(some)
+    return known[2]
 
 
 def _closed_over(function: types.FunctionType) -> list[Any]:
