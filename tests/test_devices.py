@@ -20,12 +20,12 @@ import torch
 from stages import painting_stage
 from torch import Tensor, nn
 
-from benchmarks import planner as campaign
+from benchmarks import pairs
 from kcam import Camera, Scene, analysis, isp, optics, plots, sensor, style, train
 from kcam.planner import noiseless_raw, relative_rms
 from kcam.units import nm, um
 
-PAIRS = {"random": campaign.random_pair, "adversarial": campaign.adversarial_pair}
+PAIRS = {"random": pairs.random_pair, "adversarial": pairs.adversarial_pair}
 ROUNDING = 1e-5  # float32
 SLOPES = 1e-3
 
@@ -33,7 +33,7 @@ SLOPES = 1e-3
 def pair(kind: str, seed: int) -> tuple[Camera, Scene]:
     own = {"longest": 2.0} if kind == "random" else {"sides": (48, 96)}
     camera, scene, *_ = PAIRS[kind](seed, **own)
-    return campaign.with_effects(camera, scene, f"{kind} {seed}")[0], scene
+    return pairs.with_effects(camera, scene, f"{kind} {seed}")[0], scene
 
 
 def drawn(quick: int, slow: int) -> list[Any]:

@@ -107,19 +107,15 @@ class Transfers:
 
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
         """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths
-        (L,), (L, G). Of line spreads, of which each takes its time, those of all bands may lie between some, and those
-        of many groups between all bands', which these are compared with.
+        (L,), (L, G). Of line spreads, of which each takes its time, those of all bands may lie between some.
         """
         groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
         shares = imaging.shares(wavelengths, deep=self.deep)
-        grey, own = len(wavelengths) <= len(self.few), None
-        if way is Way.BETWEEN_LINES and shares is None and len(groups) > _BETWEEN_LINES:
-            own = _ends_and_between(wavelengths, _BETWEEN_LINES)
-        elif way is Way.LINES and shares is not None and len(groups) > GROUPS:
-            own = wavelengths
-        if own is not None and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
-            groups, shares = own, shares @ _cubics(own, groups) if shares is not None else _cubics(own, wavelengths)
-        return self._slices(imaging, vergences, groups, way, grey=grey), shares
+        many = way is Way.BETWEEN_LINES and shares is None and len(groups) > _BETWEEN_LINES
+        if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
+            groups = _ends_and_between(wavelengths, _BETWEEN_LINES)
+            shares = _cubics(groups, wavelengths)
+        return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
 
     def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
         if not imaging.accuracy.blur:
@@ -249,8 +245,7 @@ def _ends_and_between(wavelengths: Tensor, count: int) -> Tensor:
 def _cubics(nodes: Tensor, wavelengths: Tensor) -> Tensor:
     """Weights (L, n) of cubics in 1/wavelength through the four nearest of the nodes (n,)."""
     numbers, order = (1e-6 / nodes).sort()
-    weights = cubic_weights(numbers, 1e-6 / wavelengths)
-    return weights[:, order.argsort()]
+    return cubic_weights(numbers, 1e-6 / wavelengths)[:, order.argsort()]
 
 
 def _inside(query: Query) -> bool:

@@ -12,13 +12,14 @@ import pytest
 import torch
 from draws import Draw
 
-from benchmarks.planner import hard_pair, random_pair
+from benchmarks.pairs import hard_pair, random_pair
 from kcam import Camera, Scene, optics, sensor
+from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
 from kcam.planner import Planner, costs, transfers
 from kcam.planner import spectra as spectra_module
-from kcam.planner.band_counts import group_counts, node_counts
+from kcam.planner.band_counts import group_counts, interpolated, node_counts
 from kcam.planner.evaluation import Evaluator, _error
 from kcam.planner.ladder import LITTLE, ORDERS, Ladder, Level
 from kcam.planner.ladders import FASTEST, MARKS, QUADRATURE
@@ -44,7 +45,7 @@ OF_DEPTH = [
     "seed", [n if n in (0, 2, 3, 6) else pytest.param(n, marks=pytest.mark.slow) for n in range(40)]
 )
 def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
-    """Cameras and scenes of benchmarks/planner.py: at one distance to two fifths; not much too small, and at most 2.5
+    """Cameras and scenes of benchmarks/pairs.py: at one distance to two fifths; not much too small, and at most 2.5
     times as large where few points are all the light (they show corners and colours of pixels), three times where a
     window as large as the picture is smaller than the blur; with depth, where things hide others, four to eight times,
     and by as much more as is said of few lights in layers, and of what is seen through little; beyond the full well not
@@ -76,10 +77,21 @@ def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
                 )
 
 
-@pytest.mark.parametrize("seed", [18, 51, 133, *(pytest.param(n, marks=pytest.mark.slow) for n in (36, 84, 102, 174))])
+BEHIND_MAPS = (
+    18,
+    51,
+    134,
+    95,
+    *(pytest.param(n, marks=pytest.mark.slow) for n in (133, 36, 84, 102, 174, 0, 1, 60, 10)),
+)
+"""Random pairs of several distances, and of one."""
+
+
+@pytest.mark.parametrize("seed", BEHIND_MAPS)
 def test_line_spreads_of_all_wavelengths_lie_between_a_few(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of deep scenes behind maps: so that groups of them are priced as by each wavelength's own."""
+    """Behind maps and aberrations: so that PSFs for several wavelengths are priced as by each one's own."""
     camera, scene, *_ = random_pair(seed)
+    rungs = [{"bands": n} for n in group_counts(28)] if is_deep(scene) else [*map(interpolated, node_counts(28))]
     found = []
     for between in (12, 99):
         monkeypatch.setattr(transfers, "_BETWEEN_LINES", between)
@@ -89,10 +101,33 @@ def test_line_spreads_of_all_wavelengths_lie_between_a_few(seed: int, monkeypatc
             evaluator, beside = planner.evaluator, planner._known[0][0].beside
             beside = {name: value for name, value in beside.items() if name != "bands"}
             assert evaluator.by_lines(beside)
-            found.append([evaluator.error({**beside, "bands": n}, beside) for n in (1, 2, 3, 4, 5, 7, 9)])
+            found.append([evaluator.error(beside | changes, beside) for changes in rungs])
     few, every = (torch.tensor(errors) for errors in found)
     assert not torch.equal(few, every)
     assert bool((few / every > 0.7).all() and (few / every < 1.8).all()), few / every
+
+
+@pytest.mark.parametrize("clusters", [False, True])
+@pytest.mark.parametrize(("few", "many"), [(2, 3), (3, 5), (4, 13), (7, 13), (9, 17)])
+def test_layers_that_are_some_of_others_need_nothing_of_their_own(
+    few: int, many: int, clusters: bool, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    glass, plate = optics.ThinLens(50 * mm), optics.ZernikeDOE(torch.tensor([0.0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 2.0]))
+    lens = optics.Lens(optics.CircularAperture(4 * mm), glass, plate, focus_distance=1.3)
+    share = torch.linspace(0, 1, 48, dtype=torch.float64)
+    depth = 1 / (0.5 + (torch.where(share < 0.5, 0.1 * share, 1 - 0.1 * share) if clusters else share))
+    light = Scene.from_rgb(torch.rand(3, 40, 48, generator=generator), depth=depth.expand(1, 1, 40, 48))
+    imaging = optics.Imaging(lens, pixel_pitch=4 * um)
+    found, computed = [], []
+    for among in (spectra_module._among, lambda *_: False):
+        monkeypatch.setattr(spectra_module, "_among", among)
+        with torch.no_grad():
+            spectra = Spectra.of(Camera(imaging), imaging.knowing(light.wavelengths), light, picture=(40, 48))
+            found.append(spectra.energies({"layers": few}, {"layers": many})[0])
+            computed.append(len(spectra.optics._sliced))
+    assert clusters or computed == [1, 2]  # in a gap between layers nothing is known
+    assert found[0] > 0
+    torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("seed", range(4))
