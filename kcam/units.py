@@ -187,9 +187,7 @@ def check_distances(distance: Tensor | float, *, name: str = "distance") -> Tens
             f"{name} {values[bad].flatten()[0].item():g} is not a distance in front of the lens: expected metres > 0, "
             "or float('inf') for infinity."
         )
-    raise ValueError(
-        f"{name} {values.min().item():g} is too near: expected metres >= {LEAST_DISTANCE:g}, such as 2.0."
-    )
+    raise ValueError(f"{name} {values.min().item():g} is too near: expected metres >= {LEAST_DISTANCE:g}, such as 2.0.")
 
 
 def warn_of_millimetres(depth: Tensor | float) -> None:

@@ -275,6 +275,26 @@ class TestScene:
         assert scene.to_srgb().shape == (0, 3, 4, 5)
         assert "depth map" in repr(scene)
 
+    @pytest.mark.parametrize("seed", range(4))
+    def test_parts_of_factors_that_dip_below_zero(self, seed: int, generator) -> None:
+        """As far as the whole lets pass, which may be more than all the light of a part."""
+        spectra = torch.ones(2, 5)
+        spectra[1, torch.randperm(5, generator=generator.manual_seed(seed))[:2]] = -1
+        planes = torch.rand(3, 2, 7, 8, generator=generator)
+        planes[:, 0] += planes[:, 1]
+        planes[1] *= 1e-4
+        planes[1, 0, 2, 3] = planes[1, 1, 2, 3] / 2
+        scene = Scene(
+            planes, wavelengths=wavelength_grid(count=5), depth=torch.tensor([1.0, 2.0, 3.0]), spectra=spectra
+        )
+        assert scene.bands().min() < 0
+        assert torch.equal(scene.samples([1]).bands(), scene.bands()[1:2])
+        assert scene.samples([2, 1]).depth.tolist() == [3.0, 2.0]
+        part = scene.crop(top=2, left=3, height=1, width=1)
+        assert torch.equal(part.bands(), scene.bands()[..., 2:3, 3:4])
+        with pytest.raises(TypeError, match=r"named in a list, such as \[1\], got 1"):
+            scene.samples(1)
+
     def test_crop(self) -> None:
         image, depth = picture(3, 6, 7), torch.arange(1.0, 43).reshape(6, 7)
         window = Scene.from_rgb(image, depth=depth).crop(top=1, left=2, height=3, width=4)

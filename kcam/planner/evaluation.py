@@ -310,11 +310,13 @@ class Evaluator:
         return Answer(raw.detach(), tuple(torch.zeros_like(p) if g is None else g for g, p in pairs))
 
     def _raw(self, sample: Sample, changes: Mapping[str, Any], shortcuts: Shortcuts = NOTHING) -> Tensor:
+        rank = changes.get("rank")
+        scene = sample.scene if rank is None else sample.low_rank(rank)
         if self.certain and changes.get("blur") is False:  # it may fill the well where blurred light does not
-            return with_imaging(self._bottomless, **changes)(sample.scene)
+            return with_imaging(self._bottomless, **changes)(scene)
         if sample.places is None or not (self.imaging and self.imaging.changed(**changes).varies):
-            return self._with(changes, shortcuts)(sample.scene)
-        scene, reach, given = sample.scene, self.imaging.reach(sample.picture), self._always | dict(changes)
+            return self._with(changes, shortcuts)(scene)
+        reach, given = self.imaging.reach(sample.picture), self._always | dict(changes)
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
         if depth.ndim > 1:  # layers lie where they lie in the whole
             own = self.imaging.changed(**given)

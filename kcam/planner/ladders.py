@@ -19,6 +19,7 @@ from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.planner.ladder import Ladder, Level
+from kcam.planner.survey import RANKS
 from kcam.scene import Scene
 
 FEW_LAYERS, TAIL = 3, 16
@@ -63,7 +64,6 @@ LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
 MARKS = (5, 13, 33)  # of these, by which the others are priced
 KAPPAS = (1.3, 1.7, 2.1)
-RANKS = (1, 2, 3, 4, 6, 9, 14)
 
 
 def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:

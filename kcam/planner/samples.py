@@ -16,6 +16,9 @@ from kcam.planner.range import COLOUR, DEPTH, OTHER_LIGHT, shares
 from kcam.planner.survey import KINDS, TILE, Survey
 from kcam.scene import Scene
 
+SPECTRA_OF = 2**18  # pixels at most that say which spectra a batch has
+SPECTRUM = 5e-4  # RMS of light that fewer spectra may leave out of any item
+
 
 @dataclass(frozen=True)
 class Sample:
@@ -24,7 +27,7 @@ class Sample:
 
     owners: whose each row is. places: of optics that vary over the picture, where the middle of each row lies from that
     of its `picture` (H, W), x and y, upright [pixels]; None where they are whole. factors: on their relative
-    errors, for the part of a scene that its crops stand for.
+    errors, for the part of a scene that its crops stand for. batch: of which they are part.
     """
 
     scene: Scene
@@ -32,6 +35,16 @@ class Sample:
     factors: tuple[float, ...]
     places: tuple[tuple[float, float], ...] | None = None
     picture: tuple[int, int] = (0, 0)
+    batch: Scene | None = None
+
+    def low_rank(self, rank: int) -> Scene:
+        """What the scene is where the batch is said in fewer spectra: those of other items count, too."""
+        batch = self.batch
+        if batch is None or batch.coefficients.shape == self.scene.coefficients.shape:
+            return self.scene.low_rank(rank)
+        step = math.ceil(math.sqrt(math.prod(batch.shape) / SPECTRA_OF))
+        thin = replace(batch, coefficients=batch.coefficients[..., ::step, ::step], depth=1.0)
+        return self.scene.low_rank(rank, whole=thin)
 
     def of_owners(self) -> list[tuple[list[int], float]]:
         """The rows of each whole, and the factor on their error."""
@@ -43,21 +56,25 @@ def samples_of(
     scenes: Sequence[Scene], surveys: Sequence[Sequence[Survey]], *, pixels: int, side: int | None = None
 ) -> list[Sample]:
     """What choices are tried on: all that there is while it has not more than so many pixels; else the scenes with the
-    largest potential of each kind, relative to what is recorded of them, those of light or distances that none of
-    these has, for potentials do not tell how wrong a choice is at one wavelength or distance, and others as they come
-    closest to the first.
+    largest potential of each kind, relative to what is recorded of them, those of light, distances or spectra that none
+    of these has, for potentials do not tell how wrong a choice is at one wavelength or distance, and others as they
+    come closest to the first.
 
     side: of the crops that are made of a single scene with more than so many pixels; None: so that they have as many.
     """
     every = [(index, row) for index, found in enumerate(surveys) for row in range(len(found))]
     if not every:
         return []
-    relative = torch.stack([surveys[index][row].relative() for index, row in every])
+    looked_at = [surveys[index][row] for index, row in every]
+    relative = torch.stack([one.relative() for one in looked_at])
     score = (relative / relative.amax(0).clamp(min=1e-30)).amax(1)
     sizes = [scenes[index].shape[1] * scenes[index].shape[2] for index, _ in every]
     chosen = list(dict.fromkeys(relative.argmax(0).tolist()))
-    for kind, least in (("light", COLOUR), ("depths", DEPTH)):
-        own = shares(torch.stack([getattr(surveys[index][row], kind) for index, row in every])) + least
+    for own in (
+        shares(torch.stack([one.light for one in looked_at])) + COLOUR,
+        shares(torch.stack([one.depths for one in looked_at])) + DEPTH,
+        torch.stack([one.left_out for one in looked_at]) + SPECTRUM,
+    ):
         while float((more := (own / own[chosen].amax(0)).amax(1)).max()) > math.sqrt(OTHER_LIGHT):
             chosen.append(int(more.argmax()))
     for other in score.argsort(descending=True, stable=True).tolist():
@@ -121,7 +138,7 @@ def _sample(
     if together.shape[1:] != (height, width):
         middle = (together.shape[2] - width) / 2, (together.shape[1] - height) / 2
         places = tuple((left + middle[0], top + middle[1]) for _, top, left in crops)
-    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops), places, (height, width))
+    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops), places, (height, width), scene)
 
 
 def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:

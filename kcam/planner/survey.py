@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -45,6 +45,9 @@ KINDS = (
 OF_DEPTH, NEIGHBOURS, BEYOND = KINDS[2:5], 5, 6
 """The kinds that nothing but depth makes hurt; the contrast between neighbours; and what the full well cuts off."""
 
+RANKS = (1, 2, 3, 4, 6, 9, 14)
+"""Numbers of spectra that may stand for all of a batch's."""
+
 CLIPPING = (ShotNoise, DarkCurrent, Clip)
 """Stages that stop at the full well."""
 
@@ -57,7 +60,8 @@ class Survey:
     light: RMS of each band as the sensor weighs it, but for a factor, (L,). depths: RMS of the light in each of the
     `DEFOCUSED` ranges of signed defocus, but for a factor. level: RMS of what is recorded [share of
     the full well]. hidden: RMS of the light that something nearer may hide, relative to it; behind: how many of the
-    pixels that is, as a share.
+    pixels that is, as a share. left_out: RMS of the light, relative to it, that each of `RANKS` leaves out of it, of
+    all that the batch has in common, (R,).
     """
 
     potential: Tensor
@@ -70,6 +74,7 @@ class Survey:
     level: float
     hidden: float
     behind: float
+    left_out: Tensor
 
     def relative(self) -> Tensor:
         """Potentials of the whole scene, in the energy that is recorded of it: (7,)."""
@@ -85,7 +90,7 @@ def survey(scene: Scene, camera: Camera, defocus: Defocus) -> list[Survey]:
     vergence = 1 / torch.as_tensor(scene.depth, dtype=torch.float64).detach().cpu()
     span = defocus.spread * float(vergence.max() - vergence.min()) if vergence.numel() else 0.0
     rows, columns = (-(-length // TILE) for length in planes.shape[2:])
-    found = []
+    found, grams = [], []
     for index, item in enumerate(planes):
         own_depth = vergence if vergence.ndim == 0 else vergence[index]  # a number for all, or each's own, or its map
         depth = own_depth.expand(1, *item.shape[1:])
@@ -125,11 +130,25 @@ def survey(scene: Scene, camera: Camera, defocus: Defocus) -> list[Survey]:
                 of_it = _per_tile(seen.square().sum(0) * share.to(seen), TILE) / _sums(seen).clamp(min=1e-30)
                 hidden += float((of_it * recorded[part]).sum())
                 behind += float(share.mean()) * recorded[part].numel() / recorded.numel()
-        bands = torch.einsum("kl,kj,jl->l", spectra, gram, spectra).clamp(min=0).sqrt() * weights.abs().sum(0)
+        grams.append(spectra.T @ gram @ spectra)
+        bands = grams[-1].diagonal().clamp(min=0).sqrt() * weights.abs().sum(0)
         level = math.sqrt(float(recorded.mean()) / (TILE * TILE * len(weights))) if recorded.numel() else 0.0
         hidden = math.sqrt(hidden / max(float(recorded.sum()), 1e-30))
-        found.append(Survey(potential, recorded, blur, far, near, bands, depths.sqrt(), level, hidden, behind))
+        none = torch.zeros(len(RANKS), dtype=torch.float64)
+        found.append(Survey(potential, recorded, blur, far, near, bands, depths.sqrt(), level, hidden, behind, none))
+    if len(found) > 1 and scene.spectra is None:
+        left_out = _left_out(torch.stack(grams), weights)
+        found = [replace(one, left_out=own) for one, own in zip(found, left_out, strict=True)]
     return found
+
+
+def _left_out(grams: Tensor, weights: Tensor) -> Tensor:
+    """Of items of a batch whose bands have inner products (B, L, L), see `Survey`: (B, R)."""
+    directions = torch.linalg.eigh(grams.sum(0)).eigenvectors.flip(-1)
+    turned, seen = directions.T @ grams @ directions, weights @ directions
+    rest = [(seen[:, rank:], turned[:, rank:, rank:]) for rank in (0, *RANKS)]
+    energies = torch.stack([torch.einsum("cl,blm,cm->b", own, of, own) for own, of in rest], dim=1).clamp(min=0)
+    return (energies[:, 1:] / energies[:, :1].clamp(min=1e-300)).sqrt()
 
 
 def _recording(camera: Camera, scene: Scene) -> tuple[Tensor, bool]:

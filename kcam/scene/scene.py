@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import warnings
 from collections.abc import Sequence
@@ -325,8 +326,16 @@ class Scene:
 
     def samples(self, rows: Sequence[int] | Tensor | slice) -> Scene:
         """Some samples of the batch, with the distances that are theirs."""
-        depth = self.depth[rows] if isinstance(self.depth, Tensor) else self.depth
-        return replace(self, coefficients=self.coefficients[rows], depth=depth)
+        planes = self.coefficients[rows]
+        if planes.ndim != 4:
+            raise TypeError(f"samples of a batch are named in a list, such as [{rows}], got {rows!r}.")
+        return self._part(planes, self.depth[rows] if isinstance(self.depth, Tensor) else self.depth)
+
+    def _part(self, coefficients: Tensor, depth: float | Tensor) -> Scene:
+        """Which was looked at with the whole: a dip that is a thousandth there may be all the light that there is."""
+        part = copy.copy(self)
+        vars(part).update(coefficients=coefficients, depth=depth)
+        return part
 
     def resized(self, size: int | tuple[int, int]) -> Scene:
         """The scene at another size: the longer side [pixels], or (height, width), for which it is cropped in its
@@ -340,8 +349,10 @@ class Scene:
         depth = fitted(self.depth, shape, pick=True) if _is_map(self.depth) else self.depth
         return replace(self, coefficients=fitted(self.coefficients, shape), depth=depth)
 
-    def low_rank(self, rank: int) -> Scene:
+    def low_rank(self, rank: int, *, whole: Scene | None = None) -> Scene:
         """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.
+
+        whole: of which it is a part, whose spectra are the closest; None for itself.
 
         bands = U S V^T, the first `rank` columns of V kept. Where that would be negative, a pixel keeps only so much of
         the columns after the first, which has one sign, that it is not. With the scene's own rank it is the same scene.
@@ -351,11 +362,7 @@ class Scene:
         if not isinstance(rank, Integral) or rank < 1:
             raise ValueError(f"rank must be at least 1, got {rank}. Use a whole number such as rank=3.")
         planes, spectra = self.coefficients, self.spectra
-        flat = planes.detach().double().transpose(0, 1).flatten(1)
-        gram = flat @ flat.T
-        mixing = torch.eye(len(gram), dtype=gram.dtype, device=gram.device) if spectra is None else spectra.detach()
-        gram = mixing.T.double() @ gram @ mixing.double()
-        directions = torch.linalg.eigh(gram).eigenvectors.flip(-1)[:, : min(rank, planes.shape[1])].to(planes)
+        directions = (self if whole is None else whole)._principal_spectra()[:, : min(rank, planes.shape[1])].to(planes)
         directions[:, 0].abs_()
         with full_precision(self.device):
             onto = directions if spectra is None else spectra @ directions
@@ -369,6 +376,15 @@ class Scene:
                 share = torch.where(first + share * rest < 0, most, share)
         new = torch.cat([brightness[:, None], new[:, 1:] * share[:, None]], dim=1)
         return replace(self, coefficients=new, spectra=directions.T)
+
+    def _principal_spectra(self) -> Tensor:
+        """Orthogonal ones (L, L), those of most light first."""
+        flat = self.coefficients.detach().double().transpose(0, 1).flatten(1)
+        gram = flat @ flat.T
+        if self.spectra is not None:
+            mixing = self.spectra.detach().double()
+            gram = mixing.T @ gram @ mixing
+        return torch.linalg.eigh(gram).eigenvectors.flip(-1)
 
     def crop(self, *, top: int, left: int, height: int, width: int) -> Scene:
         """A window of the scene, `height` x `width` pixels. Raises: ValueError unless it lies inside."""
@@ -384,7 +400,7 @@ class Scene:
             )
         window = (..., slice(top, top + height), slice(left, left + width))
         depth = self.depth[window] if _is_map(self.depth) else self.depth
-        return replace(self, coefficients=self.coefficients[window], depth=depth)
+        return self._part(self.coefficients[window], depth)
 
     def __repr__(self) -> str:
         batch, height, width = self.shape

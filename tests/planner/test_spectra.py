@@ -17,7 +17,7 @@ from kcam import Camera, Scene, optics, sensor
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
-from kcam.planner import Planner, costs, transfers
+from kcam.planner import Planner, costs, evaluation, relative_rms, transfers
 from kcam.planner import spectra as spectra_module
 from kcam.planner.band_counts import group_counts, interpolated, node_counts
 from kcam.planner.evaluation import Evaluator, _error
@@ -677,3 +677,31 @@ def test_windows_hold_the_light_of_wavelengths_far_out_of_focus(seed: int) -> No
         planner, truth = Planner(camera, scene), camera(scene)
         for tolerance in (0.1, 0.03, 0.01):
             assert planner.plan(tolerance).measure(camera, scene, truth=truth) <= tolerance
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_few_spectra_are_those_of_the_whole_batch(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of which an item that is tried is a part: the others leave little of them to a dim one of other colours."""
+    draw, count, bands = Draw(seed), 8, 16
+    items = []
+    for item in range(count):
+        spectra = torch.rand(2, bands, generator=draw.generator) ** 3
+        planes = torch.rand(1, 2, 4, 4, generator=draw.generator) * 10 ** draw.number(-3 if item else -1, 0)
+        planes = torch.nn.functional.interpolate(planes, size=(48, 48), mode="bilinear")[0]  # which blur hardly dims
+        items.append(torch.einsum("kl,khw->lhw", spectra, planes))
+    wavelengths = wavelength_grid(count=bands)
+    light = Scene.from_bands(torch.stack(items), wavelengths=wavelengths, depth=torch.linspace(1, 1.3, count))
+    lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), focus_distance=1.0)
+    camera = Camera(optics.Imaging(lens, pixel_pitch=4 * um), sensor.ColourFilter.nikon())
+    monkeypatch.setattr(evaluation, "LARGEST", 2 * 48**2)
+    with torch.no_grad():
+        evaluator = Evaluator(camera, [light])
+        evaluator.look({"bands": 3})
+        tried = [owner for sample in evaluator.samples for owner in sample.owners]
+        assert evaluator.certain
+        for rank in (1, 2, 3, 4, 6, 9):
+            ours, theirs = (camera(scene) for scene in (light.low_rank(rank), light))
+            truth = max(relative_rms(a, b) for a, b in zip(ours, theirs, strict=True))
+            if truth > 1e-3:
+                ratio = evaluator.error({"blur": False, "rank": rank}, {"blur": False}) / truth
+                assert 0.9 < ratio < 1.3, f"rank {rank} of {tried}: {ratio:.3g} of {truth:.3g}"
