@@ -73,7 +73,7 @@ bench: $(VENV)/dev.stamp
 bench-augmentation: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.augmentation
 
-# 300 random pairs of camera and scene and 100 hard ones, planned at five tolerances and measured: an hour.
+# 300 random pairs of camera and scene, 100 hard, 200 adversarial and 100 assorted ones, planned at five tolerances and measured: two hours.
 bench-planner: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.planner
 

@@ -332,7 +332,7 @@ class Scene:
         return self._part(planes, self.depth[rows] if isinstance(self.depth, Tensor) else self.depth)
 
     def _part(self, coefficients: Tensor, depth: float | Tensor) -> Scene:
-        """Which was looked at with the whole: a dip that is a thousandth there may be all the light that there is."""
+        """A part of it, which is not looked at again: a dip of a thousandth of the whole may be all the light here."""
         part = copy.copy(self)
         vars(part).update(coefficients=coefficients, depth=depth)
         return part
