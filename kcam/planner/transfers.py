@@ -197,6 +197,7 @@ class Transfers:
             # in the mean over directions a window that cuts rays off is not what it is; rings reach far with little
             self._tabled[propagator] = (
                 query is not None
+                and not _folded_across(query)
                 and imaging.accuracy.row(query).transfer_of is not None
                 and (self.fits or query.has_rings)
             )
@@ -226,6 +227,7 @@ class Transfers:
         key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
             query, like = self._query(imaging, vergences, some, window), key[1:3]
+            query = None if query is not None and _folded_across(query) else query
             if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
                 self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self.few))
             lines = None if query is None else self._line_rows[like].lines(query)
@@ -246,6 +248,14 @@ def _cubics(nodes: Tensor, wavelengths: Tensor) -> Tensor:
     """Weights (L, n) of cubics in 1/wavelength through the four nearest of the nodes (n,)."""
     numbers, order = (1e-6 / nodes).sort()
     return cubic_weights(numbers, 1e-6 / wavelengths)[:, order.argsort()]
+
+
+def _folded_across(query: Query) -> bool:
+    """Whether light finer than the pixels counts in all directions, of pixels that do not integrate: slices straight
+    from the pupil tell of what is folded along them.
+    """
+    (a, d), finest = query.scale, float(query.wavelengths.min())
+    return not query.grid.integrate and 2 * a * query.pixel_pitch > d * finest
 
 
 def _inside(query: Query) -> bool:

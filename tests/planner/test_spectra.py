@@ -705,3 +705,27 @@ def test_few_spectra_are_those_of_the_whole_batch(seed: int, monkeypatch: pytest
             if truth > 1e-3:
                 ratio = evaluator.error({"blur": False, "rank": rank}, {"blur": False}) / truth
                 assert 0.9 < ratio < 1.3, f"rank {rank} of {tried}: {ratio:.3g} of {truth:.3g}"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_light_that_is_folded_across_slices(seed: int) -> None:
+    """Of pixels that do not integrate, and larger than what optics resolve: colours are told by PSFs."""
+    draw = Draw(seed)
+    diameter = draw.number(2, 4) * mm
+    opening = draw.one_of(optics.CircularAperture(diameter), optics.AnnularAperture(diameter, obscuration=0.7))
+    plate = optics.ZernikeDOE(0.3 * torch.randn(8, generator=draw.generator, dtype=torch.float64))
+    parts = (optics.ThinLens(8 * mm), *draw.one_of((), (plate,)))
+    lens = optics.Lens(opening, *parts, focus_distance=draw.number(0.4, 2))
+    imaging = optics.Imaging(lens, pixel_pitch=draw.one_of(4, 5, 6) * um, integrate=False)
+    cube = (torch.rand(1, 28, 1, 40, generator=draw.generator) > 0.5).float().expand(1, 28, 40, 40)
+    light = Scene.from_bands(cube.contiguous(), wavelengths=wavelength_grid(), depth=draw.number(0.4, 2))
+    camera = Camera(imaging, sensor.ColourFilter.nikon())
+    with torch.no_grad():
+        evaluator = Evaluator(camera, [light])
+        evaluator.look({"bands": 3})
+        assert evaluator.certain
+        for count in (2, 4, 7):
+            ours, theirs = {"bands": count, "psf_shape": (33, 33)}, {"psf_shape": (33, 33)}
+            trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers(theirs))
+            ratio = evaluator.error(ours, theirs) / trial
+            assert 0.7 < ratio < 3, f"{count} PSFs: {ratio:.3g} of {trial:.3g}"
