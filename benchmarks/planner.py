@@ -120,6 +120,8 @@ def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
             print(f"{found['seed']}: {found['pair']}: worst {worst:.2f} of the tolerance", flush=True)
     content: dict[str, Any] = {"environment": measure.environment()}
     for kind, own in seeds.items():
+        if not own:
+            continue
         rows = [row for seed in own for row in done[f"{kind} {seed}"]["tolerances"]]
         content[kind] = {
             "pairs": len(own),
