@@ -61,6 +61,7 @@ def results_link(path: Path) -> str:
     """A link from a page of the site to a file of results."""
     return f"[`{path.name}`](../../{path.relative_to(ROOT)})"
 
+
 # ---- the propagators -------------------------------------------------------------------------------------------------
 
 
@@ -343,6 +344,7 @@ def field_picture(path: Path) -> None:
 PLANS = RESULTS / "plans"
 HONESTY, TRAINING = RESULTS / "planner.json", RESULTS / "planner_training.json"
 EFFECTS_HONESTY = RESULTS / "planner_effects.json"
+FAMILIES = ("random", "hard", "adversarial", "assorted")
 
 
 def plans_table() -> str:
@@ -372,10 +374,9 @@ PLAN_TITLES = {
 def promise_tolerance() -> str:
     """The README's sentence of what plans keep and gain."""
     content = json.loads(HONESTY.read_text())
-    kinds = ("random", "hard", "adversarial", "assorted")
-    rows = [row for kind in kinds for row in content[kind]["summary"]]
+    rows = [row for kind in FAMILIES for row in content[kind]["summary"]]
     inside, plans = (sum(row[name] for row in rows) for name in ("inside", "pairs"))
-    counts = ", ".join(f"{content[kind]['summary'][0]['pairs']} {kind}" for kind in kinds)
+    counts = ", ".join(f"{content[kind]['summary'][0]['pairs']} {kind}" for kind in FAMILIES)
     gains = [figures(row["speed_up"]) for row in content["random"]["summary"]]
     low, high = (content["random"]["summary"][index]["tolerance"] for index in (-1, 0))
     return (
@@ -417,7 +418,7 @@ def honesty_table() -> str:
         "| tolerance | inside | largest error | estimate / truth | times as fast, quartiles | predicted / measured |",
         "|---:|---:|---:|---:|---:|---:|",
     ]
-    pairs, hard, adversarial, assorted = (content[kind] for kind in ("random", "hard", "adversarial", "assorted"))
+    pairs, hard, adversarial, assorted = (content[kind] for kind in FAMILIES)
     for row in pairs["summary"]:
         low, high = row["speed_up_quartiles"]
         lines.append(

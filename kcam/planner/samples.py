@@ -5,6 +5,7 @@ Which follows from a `survey`: the items and tiles where a choice could hurt mos
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,12 +40,19 @@ class Sample:
 
     def low_rank(self, rank: int) -> Scene:
         """What the scene is where the batch is said in fewer spectra: those of other items count, too."""
+        if rank >= self.scene.coefficients.shape[1]:
+            return self.scene
+        return self.scene.low_rank(rank, principal=self._principal_spectra)
+
+    @functools.cached_property
+    def _principal_spectra(self) -> Tensor:
+        """Of the batch; kept, because each rank asks for them."""
         batch = self.batch
         if batch is None or batch.coefficients.shape == self.scene.coefficients.shape:
-            return self.scene.low_rank(rank)
+            return self.scene.principal_spectra()
         step = math.ceil(math.sqrt(math.prod(batch.shape) / SPECTRA_OF))
         thin = replace(batch, coefficients=batch.coefficients[..., ::step, ::step], depth=1.0)
-        return self.scene.low_rank(rank, whole=thin)
+        return thin.principal_spectra()
 
     def of_owners(self) -> list[tuple[list[int], float]]:
         """The rows of each whole, and the factor on their error."""

@@ -160,6 +160,16 @@ class Transfers:
         return self._widest is None or _inside(self._widest)
 
     @functools.cached_property
+    def _folded_across(self) -> bool:
+        """Whether light finer than the pixels counts in all directions, of pixels that do not integrate: slices
+        straight from the pupil tell of what is folded along them.
+        """
+        if self.imaging.integrate or (query := self._widest) is None:
+            return False
+        (a, d), finest = query.scale, float(query.wavelengths.min())
+        return 2 * a * query.pixel_pitch > d * finest
+
+    @functools.cached_property
     def corners(self) -> float:
         """Times the error along x and y that there is in the mean, at most."""
         query = self._widest
@@ -189,6 +199,8 @@ class Transfers:
         Of many layers, and in grey light, a few wavelengths have a table, else all for which PSFs may stand. One layer
         of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
         """
+        if self._folded_across:
+            return None
         one = self.deep and len(vergences) == 1
         among = torch.cat([self._ends[:1], vergences.cpu(), self._ends[1:]]) if one else vergences
         window, propagator = self.window(self.imaging, among), imaging.accuracy.propagator  # none is larger
@@ -197,7 +209,6 @@ class Transfers:
             # in the mean over directions a window that cuts rays off is not what it is; rings reach far with little
             self._tabled[propagator] = (
                 query is not None
-                and not _folded_across(query)
                 and imaging.accuracy.row(query).transfer_of is not None
                 and (self.fits or query.has_rings)
             )
@@ -223,11 +234,12 @@ class Transfers:
 
     def lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Table | None:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
+        if self._folded_across:
+            return None
         window, some = self.window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
         key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
         if key not in self._tables:
             query, like = self._query(imaging, vergences, some, window), key[1:3]
-            query = None if query is not None and _folded_across(query) else query
             if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
                 self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self.few))
             lines = None if query is None else self._line_rows[like].lines(query)
@@ -248,14 +260,6 @@ def _cubics(nodes: Tensor, wavelengths: Tensor) -> Tensor:
     """Weights (L, n) of cubics in 1/wavelength through the four nearest of the nodes (n,)."""
     numbers, order = (1e-6 / nodes).sort()
     return cubic_weights(numbers, 1e-6 / wavelengths)[:, order.argsort()]
-
-
-def _folded_across(query: Query) -> bool:
-    """Whether light finer than the pixels counts in all directions, of pixels that do not integrate: slices straight
-    from the pupil tell of what is folded along them.
-    """
-    (a, d), finest = query.scale, float(query.wavelengths.min())
-    return not query.grid.integrate and 2 * a * query.pixel_pitch > d * finest
 
 
 def _inside(query: Query) -> bool:

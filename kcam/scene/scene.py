@@ -349,10 +349,10 @@ class Scene:
         depth = fitted(self.depth, shape, pick=True) if _is_map(self.depth) else self.depth
         return replace(self, coefficients=fitted(self.coefficients, shape), depth=depth)
 
-    def low_rank(self, rank: int, *, whole: Scene | None = None) -> Scene:
+    def low_rank(self, rank: int, *, principal: Tensor | None = None) -> Scene:
         """The scene as `rank` coefficient planes times `rank` spectra: the closest in least squares that stays light.
 
-        whole: of which it is a part, whose spectra are the closest; None for itself.
+        principal: `principal_spectra` of what it is a part of; None for its own.
 
         bands = U S V^T, the first `rank` columns of V kept. Where that would be negative, a pixel keeps only so much of
         the columns after the first, which has one sign, that it is not. With the scene's own rank it is the same scene.
@@ -362,7 +362,8 @@ class Scene:
         if not isinstance(rank, Integral) or rank < 1:
             raise ValueError(f"rank must be at least 1, got {rank}. Use a whole number such as rank=3.")
         planes, spectra = self.coefficients, self.spectra
-        directions = (self if whole is None else whole)._principal_spectra()[:, : min(rank, planes.shape[1])].to(planes)
+        principal = self.principal_spectra() if principal is None else principal
+        directions = principal[:, : min(rank, planes.shape[1])].to(planes, copy=True)
         directions[:, 0].abs_()
         with full_precision(self.device):
             onto = directions if spectra is None else spectra @ directions
@@ -377,8 +378,8 @@ class Scene:
         new = torch.cat([brightness[:, None], new[:, 1:] * share[:, None]], dim=1)
         return replace(self, coefficients=new, spectra=directions.T)
 
-    def _principal_spectra(self) -> Tensor:
-        """Orthogonal ones (L, L), those of most light first."""
+    def principal_spectra(self) -> Tensor:
+        """Orthogonal spectra (L, L) float64 in columns, those that hold most of the light first; without a gradient."""
         flat = self.coefficients.detach().double().transpose(0, 1).flatten(1)
         gram = flat @ flat.T
         if self.spectra is not None:
