@@ -9,14 +9,16 @@ import scipy
 import torch
 from torch import Tensor
 
-_FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings are 1/8 wide below the second, then even
+_FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings are 1/8 wide below the second, then even,
+_EDGE = 2.0**-6  # and in the corners of the pixels' frequencies
 
 
 def rings() -> Tensor:
     """Frequencies in the middle of rings, (F,) ascending from 0 [cycles per pixel]."""
     fine = _FINEST * 2 ** (torch.arange(0, 8 * round(math.log2(_FINE / _FINEST)), dtype=torch.float64) / 8)
-    even = torch.arange(_FINE, math.sqrt(0.5) + _STEP, _STEP, dtype=torch.float64)
-    return torch.cat([torch.zeros(1, dtype=torch.float64), fine, even])
+    even = torch.arange(_FINE, 0.5, _STEP, dtype=torch.float64)
+    corners = torch.arange(0.5, math.sqrt(0.5) + _EDGE, _EDGE, dtype=torch.float64)
+    return torch.cat([torch.zeros(1, dtype=torch.float64), fine, even, corners])
 
 
 def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:

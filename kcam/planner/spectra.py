@@ -275,6 +275,8 @@ class Spectra:
         factor = self.optics.corners
         if _differ(changes, against, {"interpolate_bands"}):
             factor *= self.optics.between_psfs
+        if changes.get("propagator") == against.get("propagator") == "fresnel":
+            factor *= self.optics.by_paraxial
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first

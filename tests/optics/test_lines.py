@@ -44,12 +44,14 @@ def random_question(seed: int, kind: str) -> Query:
 
 
 def slices(psfs: Tensor) -> Tensor:
-    """Of the transfer functions of PSFs (Z, L, h, w) along x and y, (Z, L, 2, F)."""
+    """Of the transfer functions of PSFs (Z, L, h, w) along x and y, and on from 0.5 along the edge, (Z, L, 2, F)."""
+    along = FREQUENCIES.clamp(max=0.5)
+    across = (FREQUENCIES.square() - along.square()).clamp(min=0).sqrt()
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in psfs.shape[-2:])
     found = []
-    for dim in (-2, -1):
-        along = psfs.sum(dim)
-        x = torch.arange(along.shape[-1], dtype=torch.float64) - along.shape[-1] // 2
-        found.append(along.to(torch.complex128) @ torch.exp(-2j * math.pi * x[:, None] * FREQUENCIES))
+    for fx, fy in ((along, across), (across, along)):
+        waves = torch.exp(-2j * math.pi * (y[:, None, None] * fy + x[:, None] * fx))
+        found.append(torch.einsum("zlyx,yxf->zlf", psfs.to(waves), waves))
     return torch.stack(found, dim=2)
 
 

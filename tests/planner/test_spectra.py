@@ -233,8 +233,11 @@ def test_transfer_functions_are_those_of_the_psf(seed: int) -> None:
     query = lens.question(Points(vergences), wavelengths, pixels)
     frequencies = torch.linspace(0.05, math.sqrt(0.5), 60, dtype=torch.float64)
     found, psfs = row.transfer(query)(frequencies, (129, 129), range(4)), row(query)
+    along = frequencies.clamp(max=0.5)  # and on from there along the edge of the pixels' frequencies
+    across = (frequencies.square() - along.square()).clamp(min=0).sqrt()
     x = torch.arange(129, dtype=torch.float64) - 64
-    expected = psfs.sum(-2) @ torch.cos(2 * math.pi * x[:, None] * frequencies)
+    waves = (torch.cos(2 * math.pi * x[:, None] * f) for f in (across, along))  # PSFs are even along both
+    expected = torch.einsum("zlyx,yf,xf->zlf", psfs, *waves)
     assert found.shape == (2, 4, 2, 60)
     assert torch.equal(found[:, :, 0], found[:, :, 1])
     torch.testing.assert_close(found[:, :, 0], expected, rtol=0, atol=3e-3)

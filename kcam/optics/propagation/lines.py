@@ -93,11 +93,11 @@ class LineTransfer:
             near, far = light.tensor_split([(self.length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
             cutoff = 2 * a * query.pixel_pitch / (d * float(query.wavelengths.min()))
-            folds = sampling.folds(cutoff).to(light)
-            asked = (frequencies.to(light)[:, None] + folds).flatten()
             active = query.grid.active if query.grid.integrate else 0.0
-            found = _between(table, asked * (2 * self.length * step)[:, None]) * torch.sinc(asked * active)
-            return found.unflatten(-1, (-1, len(folds))).sum(-1).permute(2, 0, 1, 3)
+            index, asked, weights = sampling.folded(frequencies.to(light), cutoff, active)
+            found = _between(table, asked * (2 * self.length * step)[:, None]) * weights
+            total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, index, found)
+            return total.permute(2, 0, 1, 3)
 
     @staticmethod
     def _inside(shape: tuple[int, int], step: Tensor, x: Tensor) -> Tensor:

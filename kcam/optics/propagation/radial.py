@@ -104,7 +104,7 @@ class RadialTransfer:
                kernel: J0(kappa t) at even kappa up to 2, (T, K).
                step: of t [pixels], (L,). kappa: entries of the kernel for each cycle per pixel, (L,).
                rim: T [pixels], (L,).
-               active: width of the light-sensitive part of a pixel; None where no pixel is integrated over.
+               active: width of the light-sensitive part of a pixel; 0 where no pixel is integrated over.
     """
 
     light: Tensor
@@ -112,7 +112,7 @@ class RadialTransfer:
     step: Tensor
     kappa: Tensor
     rim: Tensor
-    active: float | None
+    active: float
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
         """As `Transfer`: float64, the same along x and y."""
@@ -122,14 +122,10 @@ class RadialTransfer:
         inside = _share_inside(shape, torch.arange(end, device=step.device) * step[:, None])
         table = (self.light[chosen, :, :end] * inside[:, None]) @ self.kernel[:end]  # (L, Z, K)
         cutoff = (self.kernel.shape[-1] - 1) / float(kappa.detach().min())
-        folds = sampling.folds(cutoff).to(step.device)
-        along, across = frequencies[:, None, None] + folds[:, None], folds
-        radius = torch.sqrt(along**2 + across**2)  # (F, n, n)
-        place = (kappa[:, None] * radius.flatten()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
-        value = even_between(table, place).unflatten(-1, radius.shape)
-        if self.active is not None:
-            value = value * torch.sinc(along * self.active) * torch.sinc(across * self.active)
-        found = value.sum((-2, -1))
+        index, asked, weights = sampling.folded(frequencies, cutoff, self.active)
+        place = (kappa[:, None] * asked.abs()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
+        value = even_between(table, place) * weights
+        found = value.new_zeros(*value.shape[:-1], len(frequencies)).index_add(-1, index, value)
         found = found + self._beyond(frequencies, shape, chosen)[:, None]
         return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
 
@@ -168,7 +164,7 @@ def radial_transfer(query: Query) -> RadialTransfer:
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
         rim=rim / pitch,
-        active=query.grid.active if query.grid.integrate else None,
+        active=query.grid.active if query.grid.integrate else 0.0,
     )
 
 

@@ -15,6 +15,7 @@ KAPPA = 2.7  # pupil samples per cycle of the fastest fringe that reaches the wi
 WINDOW_MARGIN = 8  # pixels evaluated beyond the window, so that the pixel's sinc filter finds its light there
 _NYQUIST_SHARE = 0.95  # of the intensity's Nyquist pitch lambda d / 4a that the evaluation grid may use
 _CONTINUED = 64  # points over which the outermost value continues
+_SEEN = 1e-9  # of a frequency, and of its light
 _MOST_FOLDS = 12  # to either side; light of f/1.8 at 550 nm reaches as far on pixels of 12 um
 MAX_PUPIL_SAMPLES = 8192
 """Across a pupil grid. A PSF takes up to 40 float64 numbers for each sample: 21 GB at this limit, 86 GB at twice it."""
@@ -92,9 +93,23 @@ def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0)
     return torch.as_tensor(np.ascontiguousarray(box))
 
 
-def folds(cutoff: float) -> Tensor:
-    """Multiples of the pixels' frequency whose light is folded into that of the pixels, (n,): of light up to a cutoff,
-    2 a / (lambda d) [cycles per pixel], seen at frequencies up to the corner of the pixels' own, 0.71.
+def along_axis(frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a slice of a transfer function along an axis lies, (along, across) it [cycles per pixel]: from 0.5 on, as
+    light along the axis is an alias there, on the edge of the pixels' own frequencies, up to its corner.
     """
-    most = min(max(1, math.floor(cutoff + math.sqrt(0.5))), _MOST_FOLDS)
-    return torch.arange(-most, most + 1, dtype=torch.float64)
+    along = frequencies.clamp(max=0.5)
+    return along, (frequencies.square() - along.square()).clamp(max=0.25).sqrt()
+
+
+def folded(frequencies: Tensor, cutoff: float, active: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Light up to a cutoff, 2 a / (lambda d) [cycles per pixel], that pixels of an active width fold into frequencies
+    along an axis (F,), see `along_axis`: into which of them, (N,); its own frequency, below 0 on the other side of the
+    axis; and what pixels record of it.
+    """
+    most = min(max(1, math.floor(cutoff + 0.5)), _MOST_FOLDS)
+    folds = torch.arange(-most, most + 1).to(frequencies)
+    along, across = (part[:, None, None] for part in along_axis(frequencies))
+    along, across = (along + folds[:, None]).expand(-1, -1, len(folds)), across + folds
+    radius, weights = torch.hypot(along, across), torch.sinc(along * active) * torch.sinc(across * active)
+    seen = (radius < cutoff + _SEEN) & (weights.abs() > _SEEN)  # pixels without gaps fold nothing across the axis
+    return seen.nonzero()[:, 0], torch.copysign(radius, along)[seen], weights[seen]
