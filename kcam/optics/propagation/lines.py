@@ -94,9 +94,9 @@ class LineTransfer:
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
             cutoff = 2 * a * query.pixel_pitch / (d * float(query.wavelengths.min()))
             active = query.grid.active if query.grid.integrate else 0.0
-            index, asked, weights = sampling.folded(frequencies.to(light), cutoff, active)
+            into, asked, weights = sampling.folded(frequencies.to(light), cutoff, active)
             found = _between(table, asked * (2 * self.length * step)[:, None]) * weights
-            total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, index, found)
+            total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, into, found)
             return total.permute(2, 0, 1, 3)
 
     @staticmethod
