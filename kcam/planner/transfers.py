@@ -81,6 +81,7 @@ class Transfers:
         self._stages: dict[Any, Imaging] = {}  # by changes
         self._tabled: dict[Any, bool] = {}  # by propagator
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
+        self._lines: dict[Any, Transfer] = {}  # the last of them, by these and wavelengths
         self._tables: dict[Any, Table | None] = {} if imaging.known is None else dict(imaging.known.others)
         self._sliced: dict[Any, Tensor] = {}  # by table, window and wavelengths
 
@@ -253,8 +254,11 @@ class Transfers:
             query, like = self._query(imaging, vergences, some, window), key[1:3]
             if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
                 self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self.few))
-            lines = None if query is None else self._line_rows[like].lines(query)
+            alike = key[1:3], tuple(some.tolist())
+            lines = None if query is None else self._line_rows[like].lines(query, self._lines.get(alike))
             self._tables[key] = None if lines is None else Table(some.tolist(), lines)
+            if lines is not None:
+                self._lines[alike] = lines
         return self._tables[key]
 
 

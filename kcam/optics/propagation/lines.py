@@ -9,6 +9,7 @@ window is left out of each row: rays of a smooth pupil that land there; of a map
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +17,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import Pair, fast_length, lagrange, sines
+from kcam.optics.numerics import Pair, fast_length, lagrange, lagrange_weights, sines
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.cells import cell_edges, looked_up, sizes
 from kcam.optics.propagation.question import Query, residual_amplitude, residual_path
 from kcam.optics.pupil.coordinates import Pupil, from_image_side, grid_nodes, grid_spacing
 from kcam.optics.pupil.maps import pixel_weights
 from kcam.optics.pupil.rim import edge_profile
+from kcam.optics.source import Points
 from kcam.precision import full_precision
 
 _KAPPA = 1.7  # samples along a row for each fringe that reaches the window
@@ -34,25 +36,29 @@ _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
 _SLOPE = 1e-4  # semi-apertures between which slopes are taken
 _TAPS = range(-1, 3)
+_SPHERES = 3  # between which others lie: they rise with the third power of the vergence
+_MORE = 1.3  # times the samples that are needed, up to which those of other distances do
 
 
-def lines(query: Query) -> LineTransfer | None:
-    """About the transfer functions of a query; None off the axis, and beyond the paraxial model of maps of pixels."""
+def lines(query: Query, like: LineTransfer | None = None) -> LineTransfer | None:
+    """About the transfer functions of a query; None off the axis, and beyond the paraxial model of maps of pixels.
+
+    like: those of the same question about other distances, from which it takes what is the same.
+    """
     if query.points.positions is not None or (query.has_pixels and not query.paraxial):
         return None  # rows of pixels are curved in the image-side plane
     with torch.no_grad():
-        return LineTransfer(query)
+        return LineTransfer(query, like)
 
 
 class LineTransfer:
-    """Transfer functions of a query's window, and about those of smaller ones, as `row.Transfer`; of each wavelength
-    when it is first asked for.
+    """Transfer functions of a query's window, and about those of smaller ones, as `row.Transfer`.
 
     Differences between wavelengths, and between distances, are right to a tenth in the median, a third at worst; of
     maps of pixels they are up to a third too large, because rows are sampled.
     """
 
-    def __init__(self, query: Query) -> None:
+    def __init__(self, query: Query, like: LineTransfer | None = None) -> None:
         self.query = query = replace(query, grid=replace(query.grid, dtype=torch.float32))
         finest, (a, d) = float(query.wavelengths.min()), query.scale
         count = sampling.pupil_samples(
@@ -63,12 +69,8 @@ class LineTransfer:
             displacement=float(query.displacement.max()),
             kappa=_KAPPA,
         )
-        self.spacing, self.length = grid_spacing(count), fast_length(2 * count)  # |U|^2 has twice the frequencies of U
-        nodes = grid_nodes(count).to(query.device)
-        rows = [_rows(query, axis, count) for axis in range(2)]
-        self.maps = _Maps.of(query, rows, nodes) if query.has_pixels else None
-        self.axes = [_Rows.of(query, own, nodes, axis, self.maps) for axis, own in enumerate(rows)]
-        self.spreads: dict[int, Tensor] = {}
+        fits = like is not None and count <= like.spreads.count <= _MORE * count
+        self.spreads: _Spreads = like.spreads if like is not None and fits else _Spreads(query, count)
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
         """As `row.Transfer`, (Z, L, 2, F) complex128; of a smaller window than the query's own roughly: as if the light
@@ -78,24 +80,22 @@ class LineTransfer:
         if shape[0] > query.shape[0] or shape[1] > query.shape[1]:
             raise ValueError(f"line spreads are of the window {query.shape} that was asked for, not of {shape}.")
         with torch.no_grad(), full_precision(query.device):
-            for index in bands:
-                if index not in self.spreads:
-                    self.spreads[index] = self._spread(index)
-            light = torch.stack([self.spreads[index] for index in bands]).double()  # (L, 2, Z, length)
-            a, d = query.scale
-            step = query.wavelengths[list(bands)].to(light) * d / (a * self.spacing * self.length * query.pixel_pitch)
-            x = torch.fft.fftfreq(self.length, 1 / self.length, dtype=light.dtype, device=light.device)
+            light = torch.stack([self.spreads.of(query, index) for index in bands]).double()  # (L, 2, Z, length)
+            (a, d), length = query.scale, self.spreads.length
+            step = query.wavelengths[list(bands)].to(light) * d / (a * query.pixel_pitch)
+            step /= self.spreads.spacing * length
+            x = torch.fft.fftfreq(length, 1 / length, dtype=light.dtype, device=light.device)
             whole, cut = (self._inside(own, step, x) for own in (query.shape, shape))
             if tuple(shape) != tuple(query.shape):
                 shares = (light * cut).sum(-1) / (light * whole).sum(-1).clamp(min=1e-30)
                 light *= shares.flip(1)[..., None]
             light *= cut
-            near, far = light.tensor_split([(self.length + 1) // 2], dim=-1)
+            near, far = light.tensor_split([(length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
             cutoff = 2 * a * query.pixel_pitch / (d * float(query.wavelengths.min()))
             active = query.grid.active if query.grid.integrate else 0.0
             into, asked, weights = sampling.folded(frequencies.to(light), cutoff, active)
-            found = _between(table, asked * (2 * self.length * step)[:, None]) * weights
+            found = _between(table, asked * (2 * length * step)[:, None]) * weights
             total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, into, found)
             return total.permute(2, 0, 1, 3)
 
@@ -105,12 +105,38 @@ class LineTransfer:
         halves = step.new_tensor([shape[1], shape[0]])[:, None] / 2
         return (halves / step[:, None, None] - x.abs() + 0.5).clamp(0, 1)[:, :, None]
 
-    def _spread(self, index: int) -> Tensor:
-        """The light at each step along x and y from the middle on, then of those before it: (2, Z, length)."""
-        wavenumber = 2 * math.pi / float(self.query.wavelengths[index])
-        fields = (None, None) if self.maps is None else self.maps.fields(index)
+
+class _Spreads:
+    """The light along x and y of a lens, of each wavelength and distance when it is first asked for."""
+
+    def __init__(self, query: Query, count: int) -> None:
+        self.count = count
+        self.spacing, self.length = grid_spacing(count), fast_length(2 * count)  # |U|^2 has twice the frequencies of U
+        nodes, self.rows = grid_nodes(count).to(query.device), [_rows(query, axis, count) for axis in range(2)]
+        self.maps = _Maps.of(query, nodes) if query.has_pixels else None
+        self.pupils = [_Rows(query, own, nodes, axis, self.maps) for axis, own in enumerate(self.rows)]
+        self.known: dict[tuple[int, str], Tensor] = {}  # by wavelength and distance
+        self.lit: dict[tuple[str, ...], tuple[list[_Lit], list[_OntoRows]]] = {}  # by distances
+
+    def of(self, query: Query, index: int) -> Tensor:
+        """At each step along x and y from the middle on, then of those before it: (2, Z, length)."""
+        names = [f"{vergence:.12g}" for vergence in query.vergences.tolist()]
+        missing = [place for place, name in enumerate(names) if (index, name) not in self.known]
+        if missing:
+            some = tuple(names[place] for place in missing)
+            if some not in self.lit:
+                own = replace(query, points=Points(query.vergences[missing]))
+                onto = [] if self.maps is None else [self.maps.onto(own, *axis) for axis in enumerate(self.rows)]
+                self.lit[some] = [rows.at(own) for rows in self.pupils], onto
+            found = self._spread(float(query.wavelengths[index]), index, *self.lit[some])
+            self.known.update(zip(((index, name) for name in some), found.unbind(1), strict=True))
+        return torch.stack([self.known[index, name] for name in names], dim=1)
+
+    def _spread(self, wavelength: float, index: int, lit: list[_Lit], onto: list[_OntoRows]) -> Tensor:
+        wavenumber = 2 * math.pi / wavelength
+        fields = (None, None) if self.maps is None else self.maps.fields(index, onto)
         spreads = []
-        for rows, field in zip(self.axes, fields, strict=True):
+        for rows, field in zip(lit, fields, strict=True):
             phase = (wavenumber * rows.coefficients[index]).to(rows.maps) @ rows.maps.flatten(1)
             cosine, sine = sines(phase.view(-1, *rows.maps.shape[1:]))
             amplitude = rows.amplitude_inside(index)
@@ -142,19 +168,17 @@ def _fringes(query: Query, axis: int) -> float:
 class _Maps:
     """All pixel maps of a lens on common cells; see `cells.Cells`, which cuts them by the rim too.
 
-    edges: (C + 1,). phases: (E, C, C), their factors (E, L). amplitude: (C, C). onto_rows: of both axes. onto_nodes:
-    (N, C).
+    edges: (C + 1,). phases: (E, C, C), their factors (E, L). amplitude: (C, C). onto_nodes: (N, C).
     """
 
     edges: Tensor
     phases: Tensor
     factors: Tensor
     amplitude: Tensor
-    onto_rows: tuple[_OntoRows, ...]
     onto_nodes: Tensor
 
     @staticmethod
-    def of(query: Query, rows: Sequence[Tensor], nodes: Tensor) -> _Maps:
+    def of(query: Query, nodes: Tensor) -> _Maps:
         found = query.lens.pixel_maps(query.wavelengths.to(query.device))
         cells, _ = cell_edges(maps := sizes(query, found), math.inf)
         edges = torch.as_tensor(cells)
@@ -168,18 +192,18 @@ class _Maps:
                 phases.append(values)
                 factors.append(pixels.factors.detach().to(amplitude))
         onto_nodes = pixel_weights(edges, nodes.cpu(), spacing=float(nodes[1] - nodes[0])).to(amplitude)
-        edges = edges.to(query.device)
-        onto_rows = tuple(_OntoRows.of(query, own, axis, edges) for axis, own in enumerate(rows))
-        return _Maps(edges, torch.stack(phases), torch.stack(factors), amplitude, onto_rows, onto_nodes)
+        return _Maps(edges.to(query.device), torch.stack(phases), torch.stack(factors), amplitude, onto_nodes)
 
-    def fields(self, index: int) -> list[Tensor]:
+    def onto(self, query: Query, axis: int, rows: Tensor) -> _OntoRows:
+        """What rows along x (axis 0), or columns along y (axis 1), take of the cells."""
+        return _OntoRows.of(query, rows, axis, self.edges)
+
+    def fields(self, index: int, onto_rows: Sequence[_OntoRows]) -> list[Tensor]:
         """What the maps do to the light of a wavelength in the rows along x, and in the columns along y, (Z, R, N)."""
         cosine, sine = sines(torch.einsum("e,eyx->yx", self.factors[:, index], self.phases))
         re, im = cosine * self.amplitude, sine * self.amplitude
         found = []
-        for (own_re, own_im), (x, y) in zip(
-            (onto(index) for onto in self.onto_rows), ((re, im), (re.T, im.T)), strict=True
-        ):
+        for (own_re, own_im), (x, y) in zip((onto(index) for onto in onto_rows), ((re, im), (re.T, im.T)), strict=True):
             some = torch.stack([own_re @ x - own_im @ y, own_re @ y + own_im @ x])
             found.append(torch.complex(*(some @ self.onto_nodes.T)))
         return found
@@ -192,9 +216,62 @@ class _Maps:
         return passed * (nodes.abs() <= 1)  # beyond the maps there is no light
 
 
-@dataclass(frozen=True)
+class _Path:
+    """The residual path at places in the pupil, of which little depends on the distance."""
+
+    def __init__(self, query: Query, pupil: Pupil) -> None:
+        self.pupil = pupil
+        self.coefficients, self.maps = residual_path(replace(query, points=Points(query.vergences.new_zeros(1))), pupil)
+
+    def at(self, query: Query) -> tuple[Tensor, Tensor]:
+        """As `residual_path`; what spheres from many distances have beyond their parabolas lies between three."""
+        vergences = query.vergences
+        own = self.coefficients.repeat(1, len(vergences), 1)
+        own[..., 0] += vergences * query.semi_aperture**2 / 2
+        near = vergences[vergences != 0].unique()
+        if query.paraxial or not len(near):
+            return own, self.maps
+        if len(near) > _SPHERES:
+            near = torch.arange(1, _SPHERES + 1).to(near) / _SPHERES * near.max()
+        weights = lagrange_weights(torch.cat([near.new_zeros(1), near]), vergences)[:, 1:]
+        spheres = self.pupil.beyond_paraxial(near[(..., *[None] * self.pupil.rho2.ndim)])
+        coefficients = torch.cat([own, weights.expand(len(own), -1, -1)], dim=-1)
+        return coefficients, torch.cat([self.maps, spheres.expand(-1, *self.maps.shape[1:])])
+
+
 class _Rows:
-    """What is the same at all wavelengths of the rows along x, or of the columns along y.
+    """The rows along x, or the columns along y: what is the same from all distances."""
+
+    def __init__(self, query: Query, rows: Tensor, nodes: Tensor, axis: int, pixels: _Maps | None) -> None:
+        def path(side: float = 0.0) -> _Path:
+            return _Path(query, _pupil(query, nodes[None, :], rows[:, None] + side, axis))
+
+        self.axis, self.smooth, self.middle = axis, pixels is None, path()
+        self.passed = torch.ones_like(self.middle.pupil.rho2) if pixels is None else pixels.power(rows, nodes, axis)
+        self.rim, self._path = _rim(query, rows, nodes), path
+
+    @functools.cached_property
+    def sides(self) -> tuple[_Path, _Path]:
+        """Somewhat farther across the rows, and somewhat less far."""
+        return self._path(_SLOPE), self._path(-_SLOPE)
+
+    def at(self, query: Query) -> _Lit:
+        """From some distances."""
+        half, slopes = query.shape[self.axis] / 2, None
+        coefficients, maps = self.middle.at(query)
+        own = residual_amplitude(query, self.middle.pupil)
+        energy = self.rim * own**2 * self.passed
+        if self.smooth and float(query.displacement.max()) > (half - _SOFT) * query.pixel_pitch:
+            up, down = (side.at(query)[1] for side in self.sides)
+            slopes = ((up - down) / (2 * _SLOPE)).to(query.dtype)
+        energy = energy.expand(-1, *self.passed.shape).sum((-2, -1))
+        dtype, amplitude = query.dtype, self.rim * own
+        return _Lit(query, half, maps.to(dtype), coefficients, amplitude.to(dtype), energy.to(dtype), slopes)
+
+
+@dataclass(frozen=True)
+class _Lit:
+    """What is the same at all wavelengths of the light from some distances in the rows along x, or the columns along y.
 
     half: pixels from the middle of the window to its edge, across the rows. maps: (T, R, N), of coefficients (L, Z, T),
     see `residual_path`. amplitude: (1 or Z, R, N); energy: of what passes, (1 or Z,). slopes: of the maps across the
@@ -208,23 +285,6 @@ class _Rows:
     amplitude: Tensor
     energy: Tensor
     slopes: Tensor | None
-
-    @staticmethod
-    def of(query: Query, rows: Tensor, nodes: Tensor, axis: int, pixels: _Maps | None) -> _Rows:
-        half, slopes = query.shape[axis] / 2, None
-        middle = _pupil(query, nodes[None, :], rows[:, None], axis)
-        coefficients, maps = residual_path(query, middle)
-        weights, own = _rim(query, rows, nodes), residual_amplitude(query, middle)
-        energy = weights * own**2
-        if pixels is not None:
-            energy = energy * pixels.power(rows, nodes, axis)
-        elif float(query.displacement.max()) > (half - _SOFT) * query.pixel_pitch:
-            sides = (_pupil(query, nodes[None, :], rows[:, None] + side, axis) for side in (_SLOPE, -_SLOPE))
-            up, down = (residual_path(query, pupil)[1] for pupil in sides)
-            slopes = ((up - down) / (2 * _SLOPE)).to(query.dtype)
-        energy = energy.expand(-1, len(rows), len(nodes)).sum((-2, -1))
-        dtype, amplitude = query.dtype, weights * own
-        return _Rows(query, half, maps.to(dtype), coefficients, amplitude.to(dtype), energy.to(dtype), slopes)
 
     def amplitude_inside(self, index: int) -> Tensor:
         """Of the light whose rays fall into the window, (1 or Z, R, N)."""

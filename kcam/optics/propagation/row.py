@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
@@ -45,8 +45,9 @@ class Propagator(nn.Module):
         exact: whether only sampling separates the row from its physics, so that it may be chosen by cost alone.
         on_grid: whether it samples the pupil on a Cartesian grid, of so many samples as `Query.samples` says.
         transfer: query -> `Transfer`, where transfer functions are known without the PSFs.
-        lines: query -> `Transfer`, or None, for estimates: right enough to tell what other wavelengths and distances
-            change in the window of the query, and in smaller ones to a factor of 2, see `LineTransfer`.
+        lines: query, and what it gave for other distances -> `Transfer`, or None, for estimates: right enough to tell
+            what other wavelengths and distances change in the window of the query, and in smaller ones to a factor of
+            2, see `LineTransfer`.
         about: what it does, in a line of the documentation.
     Raises: ValueError for a rate that is not > 0.
     """
@@ -65,7 +66,7 @@ class Propagator(nn.Module):
         exact: bool = True,
         on_grid: bool = False,
         transfer: Callable[[Query], Transfer] | None = None,
-        lines: Callable[[Query], Transfer | None] | None = None,
+        lines: Callable[[Query, Any], Transfer | None] | None = None,
         about: str = "",
     ) -> None:
         super().__init__()
@@ -99,11 +100,14 @@ class Propagator(nn.Module):
             return None
         return self.transfer_of(query.modelled(paraxial=self.paraxial))
 
-    def lines(self, query: Query) -> Transfer | None:
-        """About the transfer functions of a query, in a fraction of the time of its PSFs, or None."""
+    def lines(self, query: Query, like: Transfer | None = None) -> Transfer | None:
+        """About the transfer functions of a query, in a fraction of the time of its PSFs, or None.
+
+        like: those of the same question about other distances, from which it takes what is the same.
+        """
         if self.lines_of is None or self.valid_for(query) is not None:
             return None
-        return self.lines_of(query.modelled(paraxial=self.paraxial))
+        return self.lines_of(query.modelled(paraxial=self.paraxial), like)
 
     def valid_for(self, query: Query) -> str | None:
         """Why the row cannot answer a query, or None."""
