@@ -18,7 +18,7 @@ from torch import Tensor
 from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.numerics import cubic_weights
-from kcam.optics.propagation.estimates import trace
+from kcam.optics.propagation.estimates import beyond_paraxial
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.propagation.sampling import along_axis
@@ -192,7 +192,7 @@ class Transfers:
     def by_paraxial(self) -> float:
         """Times the error that the paraxial model tells of these optics."""
         query = self._widest
-        return 1.0 if query is None or max(rays.beyond for rays in trace(query)) < _ALIKE else _UNLIKE
+        return 1.0 if query is None or beyond_paraxial(query) < _ALIKE else _UNLIKE
 
     @functools.cached_property
     def _widest(self) -> Query | None:

@@ -11,6 +11,7 @@ import torch
 
 from kcam import optics
 from kcam.optics import PROPAGATORS
+from kcam.optics.propagation.estimates import beyond_paraxial, trace
 from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.reference import _evaluate, _refined, convergence
@@ -93,6 +94,14 @@ def ratios(query: Query) -> dict[tuple[str, str], float]:
         error = float((row(query).double() - answer).abs().sum() / answer.abs().sum())
         found[key] = max(error, FLOOR) / max(row.error(query), FLOOR)
     return found
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_one_radius_tells_what_the_paraxial_model_leaves_out(seed: int) -> None:
+    query = random_query(seed)
+    traced = max(rays.beyond for rays in trace(query))
+    if traced > 0.1:
+        assert 0.95 < beyond_paraxial(query) / traced < (1.15 if query.lens.round else 2.2)
 
 
 def judge(seeds: range) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -10,6 +11,7 @@ from draws import Draw
 from torch import Tensor
 
 from kcam import optics
+from kcam.optics.propagation import lines
 from kcam.optics.propagation.grid import MATRIX
 from kcam.optics.propagation.question import Query
 from kcam.optics.source import PixelGrid, Points
@@ -64,9 +66,9 @@ def norm(values: Tensor) -> float:
 def test_lines_tell_what_wavelengths_and_distances_change(kind: str, seed: int) -> None:
     query = random_question(seed, kind)
     row = MATRIX.in_fresnel_range() if query.lens.has_pixels else MATRIX
-    lines = row.lines(query)
-    assert lines is not None
-    found, expected = lines(FREQUENCIES, query.shape, range(3)), slices(row(query))
+    told = row.lines(query)
+    assert told is not None
+    found, expected = told(FREQUENCIES, query.shape, range(3)), slices(row(query))
     assert found.shape == expected.shape == (2, 3, 2, 40)
     assert norm(found - expected) < 0.03
     for ours, theirs in (
@@ -83,14 +85,44 @@ def test_lines_tell_what_wavelengths_and_distances_change(kind: str, seed: int) 
 def test_what_falls_into_a_smaller_window_is_about_told(kind: str, seed: int) -> None:
     """To two thirds of what that leaves out, by the light that misses it along either axis."""
     query = random_question(seed, kind)
-    lines, smaller = MATRIX.in_fresnel_range().lines(query), (33, 41)
-    assert lines is not None
+    told, smaller = MATRIX.in_fresnel_range().lines(query), (33, 41)
+    assert told is not None
     psfs = MATRIX.in_fresnel_range()(query)
     top, left = (psfs.shape[-2] - 33) // 2, (psfs.shape[-1] - 41) // 2
     expected = slices(psfs[..., top : top + 33, left : left + 41]) - slices(psfs)
-    found = lines(FREQUENCIES, smaller, range(3)) - lines(FREQUENCIES, query.shape, range(3))
+    found = told(FREQUENCIES, smaller, range(3)) - told(FREQUENCIES, query.shape, range(3))
     if norm(expected) > 3e-3:
         assert 0.9 < norm(found) / norm(expected) < 1.7
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(4))
+def test_distances_take_what_others_have_found(kind: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the rows, and of the light from distances that both have; spheres from many distances lie between three."""
+    draw, query = Draw(100 + seed), random_question(seed, kind)
+    row = MATRIX.in_fresnel_range() if query.lens.has_pixels else MATRIX
+    ends = query.vergences.sort().values
+    between = ends[0] + (ends[1] - ends[0]) * draw.noise(5).sort().values
+    many = dataclasses.replace(query, points=Points(torch.cat([ends[:1], between, ends[1:]])))
+    alone = row.lines(many)
+    assert alone is not None
+    first = row.lines(query)
+    shared = row.lines(many, first)
+    assert shared.spreads is first.spreads
+    first(FREQUENCIES, query.shape, [0, 2])
+    looked_at: list[int] = []
+    spread = lines._Spreads._spread
+
+    def counted(self: lines._Spreads, wavelength: float, index: int, lit: list[lines._Lit], onto: list) -> Tensor:
+        looked_at.append(len(lit[0].coefficients[index]))
+        return spread(self, wavelength, index, lit, onto)
+
+    monkeypatch.setattr(lines._Spreads, "_spread", counted)
+    found = shared(FREQUENCIES, query.shape, range(3))
+    assert looked_at == [5, 7, 5]
+    torch.testing.assert_close(found, alone(FREQUENCIES, query.shape, range(3)), rtol=0, atol=2e-3)
+    each = row.lines(dataclasses.replace(query, points=Points(between[2:3])), first)
+    torch.testing.assert_close(each(FREQUENCIES, query.shape, range(3))[0], found[3], rtol=0, atol=2e-3)
 
 
 def test_in_focus_they_are_the_autocorrelation_of_the_disc() -> None:

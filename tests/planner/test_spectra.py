@@ -732,3 +732,40 @@ def test_light_that_is_folded_across_slices(seed: int) -> None:
             trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers(theirs))
             ratio = evaluator.error(ours, theirs) / trial
             assert 0.7 < ratio < 3, f"{count} PSFs: {ratio:.3g} of {trial:.3g}"
+
+
+@pytest.mark.parametrize("seed", [*range(12), *(pytest.param(n, marks=pytest.mark.slow) for n in range(12, 48))])
+def test_light_in_the_corners_of_the_frequencies(seed: int) -> None:
+    """Beyond 0.5 cycles per pixel, where a slice along an axis is of aliases: checkers of single pixels, of which all
+    lies there, but for their mean, and others whose contrast wanders. Line spreads, which know nothing of diagonals,
+    tell it to a factor of 2.
+    """
+    draw = Draw(seed)
+    diameter = draw.number(1.5, 4) * mm
+    opening: optics.Aperture = draw.one_of(
+        optics.CircularAperture(diameter),
+        optics.SquareAperture(diameter),
+        optics.AnnularAperture(diameter, obscuration=draw.number(0.2, 0.6)),
+    )
+    plate = optics.ZernikeDOE(0.3 * torch.randn(8, generator=draw.generator, dtype=torch.float64))
+    pixels = optics.DOE(draw.number(0.5, 3) * draw.noise(32, 32))
+    parts = (optics.ThinLens(draw.number(12, 50) * mm), *draw.one_of((), (plate,), (pixels,)))
+    focus = draw.number(0.4, 2)
+    imaging = optics.Imaging(optics.Lens(opening, *parts, focus_distance=focus), pixel_pitch=draw.number(2, 5) * um)
+    height, width = 36, 44
+    checkers = (-1.0) ** (torch.arange(height)[:, None] + torch.arange(width))
+    rough = draw.noise(1, 28, 4, 4).float()
+    contrast = torch.nn.functional.interpolate(rough, size=(height, width), mode="bicubic", align_corners=True)
+    cube = 1 + checkers * draw.one_of(torch.ones(1, 28, 1, 1), contrast.clamp(0, 1))
+    near = 1 / (1 / focus + draw.number(-0.05, 0.05))
+    light = Scene.from_bands(cube, wavelengths=wavelength_grid(), depth=near)
+    with torch.no_grad():
+        evaluator = Evaluator(Camera(imaging, sensor.ColourFilter.nikon()), [light])
+        evaluator.look({"bands": 3})
+        assert evaluator.certain
+        by_lines = plate in parts and not isinstance(opening, optics.SquareAperture)
+        for ours in ({"blur": False}, {"bands": 1}, {"bands": 2}):
+            trial = _error(evaluator.samples, evaluator.answers(ours), evaluator.answers({}))
+            if trial > 1e-4:
+                ratio = evaluator.error(ours, {}) / trial
+                assert (0.45 if by_lines else 0.9) < ratio < 8, f"{ours}: {ratio:.3g} of {trial:.3g}"
