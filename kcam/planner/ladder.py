@@ -24,6 +24,9 @@ foretold, not seen.
 COLOURFUL = 2.0
 """How many times as much windows may cost at a few wavelengths as at one that tells of them."""
 
+FINE = 7e-3
+"""Error below which seams between layers count: above, what planes between others miss is more."""
+
 LITTLE = 1 / 2
 """Of the error that there may be, that a rough estimate may be at its largest and be taken."""
 
@@ -52,6 +55,7 @@ class Ladder:
     first, the others are priced at one wavelength, and it says what more of them add. fastest: with which power of its
     step its error falls at most, so that rungs which cannot do are not looked at; None where any may do. marks:
     fineness of the rungs by which others are priced, of successive ones: few, so that these are computed once.
+    seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`).
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     urgency: how much more its error counts than others' where the next ladder to climb is chosen.
@@ -70,9 +74,11 @@ class Ladder:
     from_top: bool = False
     fastest: float | None = None
     marks: tuple[int, ...] = ()
+    seams: Callable[[Level], float] | None = None
     least: float = 0.0
     doubtful: bool = False
     urgency: float = 1.0
+    most: float = math.inf
     position: int = 0
     errors: dict[tuple[int, int], float] = field(default_factory=dict)
     roughly: dict[Care, dict[tuple[int, int], float]] = field(default_factory=lambda: defaultdict(dict))
@@ -101,7 +107,8 @@ class Ladder:
         if position == len(self.levels) - 1:
             return 0.0
         known = self.errors if key in self.errors else self.grey
-        return max(known[key], self.least) if key in known else self.off_by * self.roughly[Care.ROUGH][key]
+        error = max(known[key], self.least) if key in known else self.off_by * self.roughly[Care.ROUGH][key]
+        return math.hypot(error, self.seams(self.levels[position])) if self.seams and self.most < FINE else error
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -116,6 +123,7 @@ class Ladder:
 
     def price(self, evaluator: Evaluator, most: float) -> None:
         """Estimate the error of the rung that it stands on, of which there may be so much at most."""
+        self.most = most
         if self.from_top and self.position == 0:
             self.position = self._lowest(evaluator, most)
         self._price(evaluator, self.position, most)

@@ -5,6 +5,7 @@ To add a choice, write a function that gives its ladder, and a row of `LADDERS`.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -248,12 +249,27 @@ def _depth(view: _View) -> Iterator[Ladder]:
     beside = view.few(layers=False)
     marks = MARKS if view.evaluator.certain else ()
     layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
+    if view.evaluator.certain and view.imaging.accuracy.occlusion:
+        layers.seams = _seams(view, beside)
     yield layers
     if view.imaging.accuracy.occlusion:
         levels = [Level("none", {"occlusion": False}), Level("over", {})]
         if view.one and any(light >= HARDLY for light in view.evaluator.hidden):
             levels = levels[1:]  # what would be saved is less than what it takes to find out
         yield Ladder("occlusion", levels, beside, follows=layers, settled=HIDING)
+
+
+def _seams(view: _View, beside: dict[str, Any]) -> Callable[[Level], float]:
+    """What layers hide otherwise than more of them do: of 11 scenes 0.2 to 1.4 times what hiding nothing costs, times
+    1/n less 1/n of all of them. What planes between others miss falls faster.
+    """
+
+    @functools.cache
+    def hiding() -> float:
+        few = beside | ({"layers": HIDING} if view.layers > HIDING else {})
+        return view.evaluator.error(few | {"occlusion": False}, few)
+
+    return lambda level: hiding() * max(0.0, 1 / level.fineness - 1 / view.layers) if level.fineness > 1 else 0.0
 
 
 def _support(view: _View) -> Iterator[Ladder]:

@@ -81,7 +81,7 @@ class Transfers:
         self._stages: dict[Any, Imaging] = {}  # by changes
         self._tabled: dict[Any, bool] = {}  # by propagator
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
-        self._lines: dict[Any, Transfer] = {}  # the last of them, by these and wavelengths
+        self._lines: dict[Any, Transfer] = {}  # the last, of other distances, by these and wavelengths
         self._tables: dict[Any, Table | None] = {} if imaging.known is None else dict(imaging.known.others)
         self._sliced: dict[Any, Tensor] = {}  # by table, window and wavelengths
 
@@ -249,16 +249,17 @@ class Transfers:
         if self._folded_across:
             return None
         window, some = self.window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
-        key = "lines", imaging.accuracy.propagator, window, tuple(vergences.tolist()), tuple(some.tolist())
+        lens, bands = (imaging.accuracy.propagator, window), tuple(some.tolist())
+        key = "lines", *lens, bands, tuple(vergences.tolist())
         if key not in self._tables:
-            query, like = self._query(imaging, vergences, some, window), key[1:3]
-            if query is not None and like not in self._line_rows:  # the price of all wavelengths takes as long
-                self._line_rows[like] = imaging.accuracy.row(replace(query, wavelengths=self.few))
-            alike = key[1:3], tuple(some.tolist())
-            lines = None if query is None else self._line_rows[like].lines(query, self._lines.get(alike))
+            query, lines = self._query(imaging, vergences, some, window), None
+            if query is not None:
+                if lens not in self._line_rows:  # the price of all wavelengths takes as long
+                    self._line_rows[lens] = imaging.accuracy.row(replace(query, wavelengths=self.few))
+                lines = self._line_rows[lens].lines(query, self._lines.get((lens, bands)))
             self._tables[key] = None if lines is None else Table(some.tolist(), lines)
             if lines is not None:
-                self._lines[alike] = lines
+                self._lines[lens, bands] = lines
         return self._tables[key]
 
 

@@ -126,7 +126,8 @@ class _Spreads:
             some = tuple(names[place] for place in missing)
             if some not in self.lit:
                 own = replace(query, points=Points(query.vergences[missing]))
-                onto = [] if self.maps is None else [self.maps.onto(own, *axis) for axis in enumerate(self.rows)]
+                edges = None if self.maps is None else self.maps.edges
+                onto = [] if edges is None else [_OntoRows.of(own, *axis, edges) for axis in enumerate(self.rows)]
                 self.lit[some] = [rows.at(own) for rows in self.pupils], onto
             found = self._spread(float(query.wavelengths[index]), index, *self.lit[some])
             self.known.update(zip(((index, name) for name in some), found.unbind(1), strict=True))
@@ -193,10 +194,6 @@ class _Maps:
                 factors.append(pixels.factors.detach().to(amplitude))
         onto_nodes = pixel_weights(edges, nodes.cpu(), spacing=float(nodes[1] - nodes[0])).to(amplitude)
         return _Maps(edges.to(query.device), torch.stack(phases), torch.stack(factors), amplitude, onto_nodes)
-
-    def onto(self, query: Query, axis: int, rows: Tensor) -> _OntoRows:
-        """What rows along x (axis 0), or columns along y (axis 1), take of the cells."""
-        return _OntoRows.of(query, rows, axis, self.edges)
 
     def fields(self, index: int, onto_rows: Sequence[_OntoRows]) -> list[Tensor]:
         """What the maps do to the light of a wavelength in the rows along x, and in the columns along y, (Z, R, N)."""
@@ -314,7 +311,7 @@ class _OntoRows:
     maps: Tensor
 
     @staticmethod
-    def of(query: Query, rows: Tensor, axis: int, edges: Tensor) -> _OntoRows:
+    def of(query: Query, axis: int, rows: Tensor, edges: Tensor) -> _OntoRows:
         (a, d), finest, fringes = query.scale, float(query.wavelengths.min()), _fringes(query, axis)
         sides = edges.diff()
         cycles = (a * float(query.displacement.max()) / d + fringes / 2) / finest
