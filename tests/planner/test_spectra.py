@@ -17,12 +17,13 @@ from kcam import Camera, Scene, optics, sensor
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
-from kcam.planner import Planner, costs, evaluation, relative_rms, transfers
+from kcam.planner import Planner, costs, evaluation, noiseless_raw, relative_rms, transfers
 from kcam.planner import spectra as spectra_module
 from kcam.planner.band_counts import group_counts, interpolated, node_counts
 from kcam.planner.evaluation import Evaluator, _error
 from kcam.planner.ladder import LITTLE, ORDERS, Ladder, Level
 from kcam.planner.ladders import FASTEST, MARKS, QUADRATURE
+from kcam.planner.plan import with_imaging
 from kcam.planner.spectra import Care, Spectra, _compressed
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -769,3 +770,25 @@ def test_light_in_the_corners_of_the_frequencies(seed: int) -> None:
             if trial > 1e-4:
                 ratio = evaluator.error(ours, {}) / trial
                 assert (0.45 if by_lines else 0.9) < ratio < 8, f"{ours}: {ratio:.3g} of {trial:.3g}"
+
+
+@pytest.mark.parametrize(
+    "seed", [31, 105, *(pytest.param(n, marks=pytest.mark.slow) for n in (61, 118, 121, 142, *range(300, 340)))]
+)
+def test_what_fewer_layers_hide_otherwise(seed: int) -> None:
+    """At fine tolerances, where that is more than what planes between others miss: it was told 0.45 of the truth."""
+    camera, light, _, _ = random_pair(seed)
+    with torch.no_grad():
+        planner = Planner(camera, light)
+        planner.plan(1e-3)
+        depth = next((ladder for ladder in planner._ways()[0] if ladder.effect == "depth"), None)
+        if depth is None or not planner.evaluator.certain or planner.prices.of({})[0] > 1:
+            return  # nothing to tell, or too long
+        raw = noiseless_raw(camera)
+        truth = raw(light)
+        for position, level in enumerate(depth.levels[1:-1], start=1):
+            error = relative_rms(with_imaging(raw, layers=level.changes["layers"])(light), truth)
+            if 1e-4 < error < 5e-3:
+                depth.position = position
+                depth.price(planner.evaluator, 1e-3)
+                assert depth.error > 0.8 * error, f"{level.label}: {depth.error:.3g} of {error:.3g}"
