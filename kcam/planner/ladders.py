@@ -247,8 +247,11 @@ def _depth(view: _View) -> Iterator[Ladder]:
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in few]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=False)
-    marks = MARKS if view.evaluator.certain else ()
-    layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
+    if len(torch.as_tensor(view.scene.depth).unique()) == view.layers:  # distances of its own, which others miss
+        layers = Ladder("depth", [*levels, top], beside)
+    else:
+        marks = MARKS if view.evaluator.certain else ()
+        layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
     if view.evaluator.certain and view.imaging.accuracy.occlusion:
         layers.seams = _seams(view, beside)
     yield layers
