@@ -150,9 +150,12 @@ class Transfers:
         bank = imaging.bank(Points(vergences), wavelengths, pixels)
         along, across = along_axis(self.frequencies)
         axis, slices = along < 0.5, []
+        sums = []  # over x, and over y: of every other pixel, the middle one among the first
         for turned in (bank, bank.mT):
-            edge = turned[..., ::2].sum(-1, dtype=torch.float64) - turned[..., 1::2].sum(-1, dtype=torch.float64)
-            own = _spectrum(turned.sum(-2, dtype=torch.float64), along[axis]), _spectrum(edge, across[~axis])
+            first = turned.shape[-1] // 2 % 2
+            sums.append([turned[..., start::2].sum(-1, dtype=torch.float64) for start in (first, 1 - first)])
+        for (even, odd), (even_across, odd_across) in (sums[::-1], sums):
+            own = _spectrum(even + odd, along[axis]), _spectrum(even_across - odd_across, across[~axis])
             slices.append(torch.cat(own, dim=-1))
         return torch.stack(slices, dim=2)
 
@@ -257,7 +260,7 @@ class Transfers:
                 if lens not in self._line_rows:  # the price of all wavelengths takes as long
                     self._line_rows[lens] = imaging.accuracy.row(replace(query, wavelengths=self.few))
                 lines = self._line_rows[lens].lines(query, self._lines.get((lens, bands)))
-            self._tables[key] = None if lines is None else Table(some.tolist(), lines)
+            self._tables[key] = None if lines is None else Table(list(bands), lines)
             if lines is not None:
                 self._lines[lens, bands] = lines
         return self._tables[key]

@@ -735,6 +735,27 @@ def test_light_that_is_folded_across_slices(seed: int) -> None:
             assert 0.7 < ratio < 3, f"{count} PSFs: {ratio:.3g} of {trial:.3g}"
 
 
+@pytest.mark.parametrize("window", [(33, 33), (31, 33), (33, 43), (19, 23), (17, 57)])
+def test_slices_of_psfs_go_on_along_the_edge(window: tuple[int, int]) -> None:
+    """Of any window, about its middle: of two windows the sign is the same."""
+    plate = optics.ZernikeDOE(0.3 * torch.randn(8, generator=Draw(1).generator, dtype=torch.float64))
+    lens = optics.Lens(optics.CircularAperture(3 * mm), optics.ThinLens(50 * mm), plate, focus_distance=1.0)
+    imaging = optics.Imaging(lens, pixel_pitch=5 * um, psf_shape=window)
+    light = Scene.from_rgb(Draw(2).noise(1, 3, 60, 60).float(), depth=0.9)
+    told = transfers.Transfers(imaging, light, (60, 60))
+    vergences, wavelengths = torch.tensor([1.0, 1 / 0.9], dtype=torch.float64), light.wavelengths[::13]
+    with torch.no_grad():
+        found = told._of_psfs(imaging, vergences, wavelengths, window)
+        psfs = imaging.bank(Points(vergences), wavelengths, imaging.pixels(window, torch.empty(0))).double()
+    along = told.frequencies.clamp(max=0.5)
+    across = (told.frequencies.square() - along.square()).clamp(0, 0.25).sqrt()
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in window)
+    for axis, (fx, fy) in enumerate(((along, across), (across, along))):
+        waves = torch.exp(-2j * math.pi * (y[:, None, None] * fy + x[:, None] * fx))
+        expected = torch.einsum("zlyx,yxf->zlf", psfs.to(waves), waves)
+        torch.testing.assert_close(found[:, :, axis], expected, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("seed", [*range(12), *(pytest.param(n, marks=pytest.mark.slow) for n in range(12, 48))])
 def test_light_in_the_corners_of_the_frequencies(seed: int) -> None:
     """Beyond 0.5 cycles per pixel, where a slice along an axis is of aliases: checkers of single pixels, of which all
