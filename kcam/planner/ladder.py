@@ -55,7 +55,8 @@ class Ladder:
     first, the others are priced at one wavelength, and it says what more of them add. fastest: with which power of its
     step its error falls at most, so that rungs which cannot do are not looked at; None where any may do. marks:
     fineness of the rungs by which others are priced, of successive ones: few, so that these are computed once.
-    seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`).
+    seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`),
+    by `most`, what was allowed when it was last priced.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     urgency: how much more its error counts than others' where the next ladder to climb is chosen.

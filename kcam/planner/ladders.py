@@ -16,6 +16,7 @@ import torch
 from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.sampling import KAPPA
+from kcam.optics.rendering.depth import few_values
 from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
@@ -247,7 +248,8 @@ def _depth(view: _View) -> Iterator[Ladder]:
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in few]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=False)
-    if len(torch.as_tensor(view.scene.depth).unique()) == view.layers:  # distances of its own, which others miss
+    own = few_values(torch.as_tensor(view.scene.depth), at_most=view.layers)
+    if own is not None and len(own) == view.layers:  # distances of its own, which others miss
         layers = Ladder("depth", [*levels, top], beside)
     else:
         marks = MARKS if view.evaluator.certain else ()
