@@ -136,6 +136,11 @@ class Accuracy(Recipe):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
+    def recipe(self) -> Recipe:
+        """How PSFs are computed, without all else."""
+        return Recipe(**{field.name: getattr(self, field.name) for field in fields(Recipe)})
+
+    @property
     def per_band(self) -> bool:
         """Whether bands are kept apart until the layers of depth are over one another."""
         return self.occlusion and self.coverage == "band"

@@ -322,8 +322,7 @@ class Imaging(Stage):
 
         if self.known is None or torch.is_grad_enabled():
             return compute(points.vergences, wavelengths, pixels)
-        how = tuple(getattr(self.accuracy, field.name) for field in fields(Recipe))
-        return self.known.bank(how, points.vergences, wavelengths, pixels, compute)
+        return self.known.bank(self.accuracy.recipe, points.vergences, wavelengths, pixels, compute)
 
     def computed_lens(self, *, by: str) -> Lens:
         """The lens, for what asks it more than PSFs. Raises: ValueError, which says `by` whom, where there is none."""

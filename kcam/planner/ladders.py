@@ -35,6 +35,9 @@ FASTEST, FASTEST_COLOURS = 2.0, 4.0
 behind maps errors of such groups fall with 2.8 at most from one on, with 4.3 from two (6 from two to three).
 """
 
+FEW_DISTANCES = 33
+"""Of a scene whose layers are at its own distances, up to which others do not converge; more are a ramp."""
+
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
 
@@ -64,7 +67,7 @@ UNRECORDED, FARTHER = 1e-3, 1.2  # RMS of light of a wavelength, of that of all,
 # like; how much farther rays may go at others than at those that tell of a window
 LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
-MARKS = (5, 13, 33)  # of these, by which the others are priced
+MARKS = (5, 13, 33, 65)  # of these, by which the others are priced
 KAPPAS = (1.3, 1.7, 2.1)
 
 
@@ -248,8 +251,8 @@ def _depth(view: _View) -> Iterator[Ladder]:
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in few]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=False)
-    own = few_values(torch.as_tensor(view.scene.depth), at_most=view.layers)
-    if own is not None and len(own) == view.layers:  # distances of its own, which others miss
+    own = few_values(torch.as_tensor(view.scene.depth), at_most=FEW_DISTANCES)
+    if own is not None and len(own) == view.layers:  # of its own, which other layers miss
         layers = Ladder("depth", [*levels, top], beside)
     else:
         marks = MARKS if view.evaluator.certain else ()

@@ -83,7 +83,7 @@ class Transfers:
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
         self._lines: dict[Any, Transfer] = {}  # the last, of other distances, by these and wavelengths
         self._tables: dict[Any, Table | None] = {} if imaging.known is None else dict(imaging.known.others)
-        self._sliced: dict[Any, Tensor] = {}  # by table, window and wavelengths
+        self._sliced: dict[Any, Tensor] = {}  # by table, or how PSFs are computed, window and wavelengths
 
     def stage(self, changes: Mapping[str, Any]) -> Imaging:
         """With changes: kept, because each setting is asked about often."""
@@ -130,13 +130,15 @@ class Transfers:
         if known is None and way is not Way.PSFS:
             own = self._wider(imaging, vergences) if way is Way.WHOLE_LINES else imaging
             known = self.lines(own, vergences, wavelengths)
-        if known is None:
-            found = self._of_psfs(imaging, vergences, wavelengths, window)
-        else:
-            key = id(known), window, tuple(wavelengths.tolist())
-            if key not in self._sliced:
-                self._sliced[key] = known(self.frequencies, window, wavelengths).cpu()
-            found = self._sliced[key]
+        own = ("PSFs", imaging.accuracy.recipe, tuple(vergences.tolist())) if known is None else (id(known),)
+        key = *own, window, tuple(wavelengths.tolist())
+        if key not in self._sliced:
+            self._sliced[key] = (
+                self._of_psfs(imaging, vergences, wavelengths, window)
+                if known is None
+                else known(self.frequencies, window, wavelengths).cpu()
+            )
+        found = self._sliced[key]
         return found / found[..., :1] if imaging.accuracy.renormalise else found
 
     def _wider(self, imaging: Imaging, vergences: Tensor) -> Imaging:

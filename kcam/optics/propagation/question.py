@@ -28,6 +28,7 @@ from kcam.optics.pupil.coordinates import Pupil, pupil_tau
 from kcam.optics.pupil.maps import pixel_under
 from kcam.optics.source import PixelGrid, Points
 
+_AT_ONCE = 8  # wavelengths whose rays are looked at: more do not stay in a processor's cache
 _DISPLACEMENTS = ValueCache(16)  # the last: a picture asks for its own at each step
 _SPREAD = 1e-6  # share of the light that the structure of a radius may send beyond the displacement that is sampled
 
@@ -197,8 +198,14 @@ class Query:
     def spread(self, share: float) -> Tensor:
         """As `displacement`, for another share of the light that a profile of rings may scatter beyond it."""
         with torch.no_grad():
-            ends, asked = _outermost(self).vergences, (self.wavelengths, self.device, self.paraxial, share)
-            return _DISPLACEMENTS.get((self.lens, ends, *asked), lambda: _ray_displacement(self, share))
+            scattered = (share, self.wavelengths) if self.has_rings else ()  # by the outermost of these
+            asked = self.lens, _outermost(self).vergences, self.device, self.paraxial, scattered
+            known: dict[float, float] = _DISPLACEMENTS.get(asked, dict)  # by wavelength
+            wavelengths = self.wavelengths.tolist()
+            if missing := [index for index, wavelength in enumerate(wavelengths) if wavelength not in known]:
+                found = _ray_displacement(replace(self, wavelengths=self.wavelengths[missing]), share)
+                known.update(zip((wavelengths[index] for index in missing), found.tolist(), strict=True))
+            return self.wavelengths.new_tensor([known[wavelength] for wavelength in wavelengths])
 
     @functools.cached_property
     def panels(self) -> Tensor:
@@ -369,13 +376,15 @@ def _ray_displacement(query: Query, share: float) -> Tensor:
                 return rings
             coefficients = torch.stack([coefficient for coefficient, _ in terms], dim=-1)[:, None]
             maps = _stacked([term for _, term in terms])
-        inside = (pupil.rho2 <= 1.0001) | (not lens.round)
+        inside = ((pupil.rho2 <= 1.0001) | (not lens.round)).flatten()
         step = float(side[1] - side[0]) * float(query.semi_aperture)
         gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
-        slope2 = torch.stack([(coefficients.flatten(0, 1) @ g.flatten(1)) ** 2 for g in gradients]).sum(0)
-        slope2 = torch.where(inside.flatten(), slope2, slope2.new_zeros(()))
-        slope = slope2.amax(dim=1).sqrt().view(query.wavelengths.numel(), -1).amax(dim=1)
-        return rings + (slope * query.sensor_distance).cpu()
+        gradients = [gradient.flatten(1)[:, inside] for gradient in gradients]
+        farthest = []
+        for some in coefficients.split(_AT_ONCE):
+            slopes2 = functools.reduce(Tensor.add_, [(some.flatten(0, 1) @ own).square_() for own in gradients])
+            farthest.append(slopes2.amax(dim=1).view(len(some), -1).amax(dim=1))
+        return rings + (torch.cat(farthest).sqrt() * query.sensor_distance).cpu()
 
 
 def _ring_displacement(query: Query, scatter: Scatter, share: float) -> float:
