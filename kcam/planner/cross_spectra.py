@@ -11,6 +11,7 @@ from torch import Tensor
 
 _FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings are 1/8 wide below the second, then even,
 _EDGE = 2.0**-6  # and in the corners of the pixels' frequencies
+_PART = 32  # frequencies that are summed at once
 
 
 def rings() -> Tensor:
@@ -31,22 +32,20 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
         found[..., 1:width] *= math.sqrt(2)  # each stands for one to the left of the middle, too
     else:
         found = scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho")
-    order, counts = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
-    spectrum = torch.as_tensor(found).flatten(1).index_select(1, order)
+    order, beyond, into = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
+    spectrum = torch.as_tensor(found).flatten(1).index_select(1, order).index_fill_(1, beyond, 0)
     if dark:
-        spectrum, counts = torch.view_as_real(spectrum).flatten(1), [2 * count for count in counts]
-    found = torch.zeros(len(counts), len(planes), len(planes), dtype=torch.float64)
-    filled = [ring for ring, count in enumerate(counts) if count]  # the widest waves of a small picture are few
-    parts = spectrum.split([counts[ring] for ring in filled], dim=1)
-    found[filled] = torch.stack([part @ part.T for part in parts]).double()
-    return found.unflatten(0, (2, -1))
+        spectrum = torch.view_as_real(spectrum).flatten(1)
+    parts = spectrum.unflatten(1, (len(into), -1)).transpose(0, 1)
+    sums = torch.zeros(2 * len(frequencies), len(planes), len(planes), dtype=torch.float64)
+    return sums.index_add_(0, into, (parts @ parts.mT).double()).unflatten(0, (2, -1))
 
 
 @functools.lru_cache(maxsize=8)
 @torch.inference_mode(False)
-def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: bool) -> tuple[Tensor, list[int]]:
-    """The order in which a spectrum's frequencies lie in rings, first of light that runs along x, then along y, and how
-    many lie in each.
+def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """The order in which a spectrum's frequencies lie in rings, first of light that runs along x, then along y, in
+    parts of `_PART`, the last of a ring filled up; which of them fill up; and the ring of each part.
     """
     if dark:
         fy = torch.fft.fftfreq(2 * height, dtype=torch.float64).abs()
@@ -56,4 +55,10 @@ def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: 
     middles = torch.tensor(frequencies, dtype=torch.float64)
     ring = torch.bucketize(torch.hypot(fy[:, None], fx).flatten(), (middles[1:] + middles[:-1]) / 2)
     label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
-    return label.argsort(stable=True), label.bincount(minlength=2 * len(frequencies)).tolist()
+    counts = label.bincount(minlength=2 * len(frequencies))  # the widest waves of a small picture are few
+    parts = -(-counts // _PART)
+    into = torch.arange(len(counts)).repeat_interleave(parts)
+    before = (parts.cumsum(0) - parts) * _PART - (counts.cumsum(0) - counts)  # what fills up the rings before
+    place = torch.arange(len(label)) + before.repeat_interleave(counts)
+    order = torch.zeros(len(into) * _PART, dtype=torch.long).index_copy_(0, place, label.argsort(stable=True))
+    return order, torch.ones_like(order).index_fill_(0, place, 0).nonzero()[:, 0], into

@@ -135,10 +135,10 @@ class Evaluator:
             self.spectra = None
 
     def _sharply(self, imaging: Imaging, told: Sequence[Spectra], settings: Mapping[str, Any]) -> bool:
-        """See the same without blur, where that tells as much: of light that mirrors go on with, of which nothing is
-        cut off, as of a few lights that stand out, and not more where pixels see little of its colour.
+        """See the same without blur, where that tells as much: of light of which nothing is cut off, as of a few lights
+        that stand out, and not more where pixels see little of its colour.
         """
-        known = imaging.border == "reflect" and isinstance(imaging.lens, Lens)  # whose PSFs brighten nothing
+        known = isinstance(imaging.lens, Lens)  # whose PSFs brighten nothing
         if not known or any(bool(spectra.few_lights.any()) for spectra in told):
             return False
         self.signals = self._signals(sharp := {**settings, "blur": False})
@@ -147,6 +147,8 @@ class Evaluator:
             return False
         self._compare(sharp)
         if max(spectra.unlike for spectra in told) > UNLIKE:
+            return False
+        if imaging.border != "reflect" and not all(spectra.frame(settings) for spectra in told):
             return False
         self.dimmed = [row for spectra in told for row in spectra.dimmed(settings)]
         return True

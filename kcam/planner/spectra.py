@@ -28,7 +28,8 @@ from kcam.camera import Camera
 from kcam.isp import Clip
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
-from kcam.optics.numerics import cubic_weights
+from kcam.optics.numerics import bracketed, cubic_weights
+from kcam.optics.rendering.borders import extend
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
@@ -63,6 +64,8 @@ _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
+_OUTSIDE = 1.4  # times that more is lost beyond the borders: 0.9 to 1.5 of 22 pictures, of 1.03 to 1.5
+_FRAMED = 64  # pixels of the shorter side, of which there are as many again, that tell what falls into the picture
 _PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _BETWEEN_LAYERS = 4  # times as many layers as there are in a setting, between whose transfer functions its own lie
 _SAME_LAYER = 1e-6  # of the range of depth
@@ -104,6 +107,7 @@ class Spectra:
         self.frequencies = optics.frequencies
         self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
         self._unlike = torch.ones(len(scene.coefficients), dtype=torch.float64)  # see `compare`
+        self._framed = torch.ones_like(self._unlike)  # see `frame`
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
 
@@ -141,8 +145,29 @@ class Spectra:
     def dimmed(self, settings: Mapping[str, Any]) -> list[float]:
         """How much less light there is of each row with some settings than without blur: RMS over RMS."""
         sharp, seen = (self._whole(own, Way.LINES) for own in ({**settings, "blur": False}, settings))
-        found: list[float] = (sharp / seen.clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
+        found: list[float] = (sharp / (seen * self._framed).clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
         return found
+
+    def frame(self, settings: Mapping[str, Any]) -> bool:
+        """Know what light of each row falls into the picture with some settings, of what there is where borders are
+        mirrors, or of all that there is where it is dark beyond them: by PSFs that are products of line spreads.
+
+        Returns: whether spectra tell of this scene, as `compare`.
+        """
+        border, imaging = self.imaging.border, self.optics.stage(settings)
+        for index, (rows, scene) in enumerate(self.groups):
+            light, vergences = self._light[rows], self._of(index, settings.get("layers")).vergences
+            shares = self._cutting(scene, settings.get("layers")).layers_of(scene, light)[1]
+            step = max(1, min(light.shape[-2:]) // _FRAMED)
+            planes = functional.avg_pool2d(light if shares is None else light * shares, step)
+            transfer = self.optics.of(imaging, vergences, scene.wavelengths, Way.LINES)[0].mean(1)
+            inside, everywhere = _blurred(planes, transfer, self.frequencies * step, border)
+            if border != "zero":
+                everywhere, _ = _blurred(planes, transfer, self.frequencies * step, "reflect")
+            framed = (inside / everywhere.clamp(min=1e-300)).clamp(min=1e-3)
+            self._framed[rows] = 1 / (1 + _OUTSIDE * (1 / framed - 1)).clamp(min=1e-3)
+        self._unlike = (self._unlike / self._framed).clamp(min=1)
+        return border != "replicate" or float(self._framed.max()) < _GOES_ON
 
     def _whole(self, settings: Mapping[str, Any], way: Way) -> Tensor:
         """The energy of each row with some settings, (B,)."""
@@ -400,6 +425,22 @@ def _among(vergences: Tensor, others: Tensor) -> bool:
         return True
     apart = (vergences[:, None] - others).abs().amin(1)
     return bool((apart <= _SAME_LAYER * (others.max() - others.min())).all())
+
+
+def _blurred(planes: Tensor, transfer: Tensor, frequencies: Tensor, border: str) -> tuple[Tensor, Tensor]:
+    """Energy of light in layers (B, Z, H, W), blurred by transfer functions along x and y (Z, 2, F) at frequencies
+    (F,): in the picture, and with as much again around it, (B,).
+    """
+    height, width = planes.shape[-2:]
+    light = torch.fft.rfft2(extend(planes, (height + 1, width + 1), border))
+    for axis, own in enumerate((torch.fft.rfftfreq(2 * width), torch.fft.fftfreq(2 * height))):
+        low, share = bracketed(frequencies, own.abs().to(frequencies))
+        along = torch.lerp(transfer[:, axis, low], transfer[:, axis, low + 1], share.to(transfer.dtype))
+        along = torch.where(own < 0, along.conj(), along).to(light)
+        light = light * (along[:, :, None] if axis else along[:, None])
+    seen = torch.fft.irfft2(light.sum(1), s=(2 * height, 2 * width)).square()
+    inside = seen.narrow(1, (height + 1) // 2, height).narrow(2, (width + 1) // 2, width)
+    return inside.sum((1, 2)).double().cpu(), seen.sum((1, 2)).double().cpu()
 
 
 def _compressed(scene: Scene) -> Scene:

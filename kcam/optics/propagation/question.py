@@ -376,10 +376,10 @@ def _ray_displacement(query: Query, share: float) -> Tensor:
                 return rings
             coefficients = torch.stack([coefficient for coefficient, _ in terms], dim=-1)[:, None]
             maps = _stacked([term for _, term in terms])
-        inside = ((pupil.rho2 <= 1.0001) | (not lens.round)).flatten()
+        inside = ((pupil.rho2 <= 1.0001) | (not lens.round)).flatten().nonzero()[:, 0]
         step = float(side[1] - side[0]) * float(query.semi_aperture)
         gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
-        gradients = [gradient.flatten(1)[:, inside] for gradient in gradients]
+        gradients = [gradient.flatten(1).index_select(1, inside) for gradient in gradients]
         farthest = []
         for some in coefficients.split(_AT_ONCE):
             slopes2 = functools.reduce(Tensor.add_, [(some.flatten(0, 1) @ own).square_() for own in gradients])
