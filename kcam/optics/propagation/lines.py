@@ -27,7 +27,7 @@ from kcam.optics.pupil.rim import edge_profile
 from kcam.optics.source import Points
 from kcam.precision import full_precision
 
-_KAPPA = 1.7  # samples along a row for each fringe that reaches the window
+_KAPPA = 1.5  # samples along a row for each fringe that reaches the window
 _ROWS = 48  # of a smooth pupil at least, and one for so many samples along it
 _PER_ROW = 6
 _SAMPLED = 32  # rows of a map of pixels at least, fewer than twice as many
@@ -85,9 +85,10 @@ class LineTransfer:
             step = query.wavelengths[list(bands)].to(light) * d / (a * query.pixel_pitch)
             step /= self.spreads.spacing * length
             x = torch.fft.fftfreq(length, 1 / length, dtype=light.dtype, device=light.device)
-            whole, cut = (self._inside(own, step, x) for own in (query.shape, shape))
+            cut = self._inside(shape, step, x)
             if tuple(shape) != tuple(query.shape):
-                shares = (light * cut).sum(-1) / (light * whole).sum(-1).clamp(min=1e-30)
+                whole = (light * self._inside(query.shape, step, x)).sum(-1).clamp(min=1e-30)
+                shares = (light * cut).sum(-1) / whole
                 light *= shares.flip(1)[..., None]
             light *= cut
             near, far = light.tensor_split([(length + 1) // 2], dim=-1)
