@@ -226,7 +226,8 @@ class Planner:
         if self._known is None:
             prices = self.prices
             every = ladders(self.evaluator, prices.scene, one=self.one)
-            steps = [ladder for ladder in every if not ladder.doubtful or self.prices.saves(ladder)]
+            later = self.one and self.evaluator.certain  # `_settle` asks whether they are worth it
+            steps = [ladder for ladder in every if later or not ladder.doubtful or prices.saves(ladder)]
             skips = [Skip(self.camera, index, self.evaluator) for index in self.evaluator.skippable()]
             self._known = steps, skips
         return self._known

@@ -95,6 +95,6 @@ class Prices:
 
     def worth(self, ladder: Ladder, changes: Mapping[str, Any]) -> bool:
         """Whether its cheapest rung saves more beside such changes than pricing it takes."""
-        foot, beside = ladder.levels[0].changes, ladder.beside
-        saved = self.of(changes)[0] - self.of({**changes, **foot})[0]
-        return saved > self.of(beside)[0] + self.of({**beside, **foot})[0]
+        foot, beside, now = ladder.levels[0].changes, ladder.beside, self.of(changes)[0]
+        saved = now - self.of({**changes, **foot})[0]
+        return saved > (1 - GAIN) * now and saved > self.of(beside)[0] + self.of({**beside, **foot})[0]
