@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 import random
 from collections.abc import Iterator
@@ -244,3 +246,34 @@ def test_explain_takes_the_arguments_of_psf_and_shows_what_is_refused() -> None:
     assert "needs a lens of rotationally symmetric elements" in str(told)
     with pytest.raises(ValueError, match="unknown propagator 'wave'"):
         lens.explain([550 * nm], distances=2.0, pixel_pitch=4 * um, shape=(33, 33), propagator="wave")
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_how_far_rays_go_is_told_wavelength_by_wavelength(seed: int) -> None:
+    """Whatever was asked before; of rings by the outermost wavelengths that are asked; and anew of another lens."""
+    query = random_query(seed)
+    grid = torch.linspace(400, 700, 13, dtype=torch.float64) * nm
+    every = dataclasses.replace(query, wavelengths=grid)
+    some = torch.tensor([3, 11, 7, 3])
+    torch.manual_seed(seed)
+    asked = dataclasses.replace(query, wavelengths=grid[some])
+    first, whole = asked.spread(1e-6), every.spread(1e-6)
+    if not query.has_rings:
+        assert torch.equal(first, whole[some])
+        alone = dataclasses.replace(query, lens=copy.deepcopy(query.lens), wavelengths=grid[8:9]).spread(1e-6)
+        torch.testing.assert_close(alone, whole[8:9], rtol=1e-12, atol=0)
+    assert bool((whole >= 0).all())
+    other = copy.deepcopy(query.lens)
+    other.sensor_distance = torch.as_tensor(other.sensor_distance) * 1.01
+    assert not torch.equal(dataclasses.replace(every, lens=other).spread(1e-6), whole)
+
+
+@pytest.mark.parametrize("aperture", [optics.CircularAperture(4 * mm), optics.SquareAperture(4 * mm)])
+def test_rays_go_where_their_slope_says(aperture: optics.Element) -> None:
+    """Of an ideal lens out of focus, in the paraxial model: by a d |V - focus|, and by sqrt 2 of that from corners."""
+    lens = optics.Lens(aperture, optics.ThinLens(50 * mm), focus_distance=2.0)
+    corner = 1.0 if lens.round else math.sqrt(2)
+    for distance in (0.7, 1.3, 5.0, math.inf):
+        query = lens.query([550 * nm], distances=distance, pixel_pitch=4 * um, shape=(65, 65)).modelled(paraxial=True)
+        expected = corner * 2 * mm * float(query.sensor_distance) * abs(1 / distance - 1 / 2.0)
+        assert float(query.displacement) == pytest.approx(expected, rel=0.03)

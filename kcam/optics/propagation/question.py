@@ -379,10 +379,10 @@ def _ray_displacement(query: Query, share: float) -> Tensor:
         inside = ((pupil.rho2 <= 1.0001) | (not lens.round)).flatten().nonzero()[:, 0]
         step = float(side[1] - side[0]) * float(query.semi_aperture)
         gradients = torch.gradient(maps, spacing=step, dim=-1 if maps.ndim == 2 else (-2, -1))
-        gradients = [gradient.flatten(1).index_select(1, inside) for gradient in gradients]
+        along = [gradient.flatten(1).index_select(1, inside) for gradient in gradients]
         farthest = []
         for some in coefficients.split(_AT_ONCE):
-            slopes2 = functools.reduce(Tensor.add_, [(some.flatten(0, 1) @ own).square_() for own in gradients])
+            slopes2 = functools.reduce(Tensor.add_, [(some.flatten(0, 1) @ own).square_() for own in along])
             farthest.append(slopes2.amax(dim=1).view(len(some), -1).amax(dim=1))
         return rings + (torch.cat(farthest).sqrt() * query.sensor_distance).cpu()
 
