@@ -25,7 +25,7 @@ from kcam.scene import Scene
 from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free
 
-WORTH, WORTH_DEEP = 0.2, 0.4
+WORTH, WORTH_DEEP = 0.2, 0.3
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and with a
 map of depth; each picture of a batch adds an eighth: measured.
 """
