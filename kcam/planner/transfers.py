@@ -27,7 +27,7 @@ from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
 
-_BETWEEN_LINES = 9  # wavelengths, between whose line spreads those of all bands lie
+_BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
 GROUPS = 7  # PSFs, up to whose number errors are told so: 0.9 to 1.15 times what they are by each band's own line
 # spread (5 to 95 % of 36 deep scenes behind maps), and 0.9 to 1.3 of PSFs between others, of which 6 are told worst
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
