@@ -14,6 +14,7 @@ import torch
 from kcam.camera import Camera
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
+from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladder import Ladder
 from kcam.planner.ladders import ladders
@@ -128,7 +129,8 @@ class Planner:
             return False
         scene = self.prices.scene
         worth = WORTH_DEEP if is_deep(scene) else WORTH
-        return self.prices.of({})[0] > worth * (1 + scene.shape[0] / 8)
+        usual = self.prices.rates | costs.RATES  # on a slower machine a plan takes longer, too
+        return costs.seconds(self.prices.work({}), usual) > worth * (1 + scene.shape[0] / 8)
 
     @no_more_than_free()
     def plan(self, tolerance: float | str) -> Plan:

@@ -34,7 +34,7 @@ class Prices:
         self.apart = evaluator.apart if evaluator.varies and evaluator.samples and not one else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
-        self.kept: dict[tuple[Any, ...], tuple[float, float]] = {}
+        self.kept: dict[tuple[Any, ...], Work] = {}
         self.scene = scenes[0]
         if len(scenes) > 1:
             self.scene = max(scenes, key=lambda scene: self._seconds(scene))
@@ -69,8 +69,11 @@ class Prices:
         return 0.0 if self.imaging is None else costs.seconds(self._work(scene, {}), self.rates)
 
     def work(self, changes: Mapping[str, Any]) -> Work:
-        """With changes of the Imaging."""
-        return self._work(self.scene, changes)
+        """With changes of the Imaging; kept, because tables ask for all of them again."""
+        key = tuple(sorted(changes.items()))
+        if key not in self.kept:
+            self.kept[key] = self._work(self.scene, changes)
+        return self.kept[key]
 
     def _work(self, scene: Scene, changes: Mapping[str, Any]) -> Work:
         if self.imaging is None:
@@ -83,11 +86,8 @@ class Prices:
 
     def of(self, changes: Mapping[str, Any]) -> tuple[float, float]:
         """(seconds, bytes) with changes of the Imaging."""
-        key = tuple(sorted(changes.items()))
-        if key not in self.kept:
-            work = self.work(changes)
-            self.kept[key] = (costs.seconds(work, self.rates), work.memory)
-        return self.kept[key]
+        work = self.work(changes)
+        return costs.seconds(work, self.rates), work.memory
 
     def saves(self, ladder: Ladder) -> bool:
         """Whether its cheapest rung takes less time than its top."""

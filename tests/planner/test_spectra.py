@@ -167,6 +167,20 @@ def test_a_single_picture_prices_what_pays(seed: int, asked: bool, monkeypatch: 
     assert asked or "kappa" not in changes
 
 
+@pytest.mark.parametrize("seed", [10, 188, 31, 29])
+def test_whether_a_plan_pays_is_the_same_on_a_slower_machine(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Making it takes longer there, too."""
+    camera, scene, *_ = random_pair(seed)
+    told = []
+    for slower in (0.1, 1, 10):
+        rates = {kind: slower * rate for kind, rate in costs.RATES.items()}
+        monkeypatch.setattr(costs, "current_rates", lambda _, rates=rates: rates)
+        planner = Planner(camera, scene, one=True)
+        told.append((planner.pays, planner.prices.of({})[0] / slower))
+    assert len({pays for pays, _ in told}) == 1
+    assert max(seconds for _, seconds in told) == pytest.approx(min(seconds for _, seconds in told))
+
+
 SHARP = {44, 46, 60}
 """Seeds of random pairs that are looked at without blur, and tested by `make test`."""
 
