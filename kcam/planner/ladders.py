@@ -287,11 +287,12 @@ def _support(view: _View) -> Iterator[Ladder]:
         return Level(f"{shape[0]} x {shape[1]} px" + (", rescaled" if renormalise else ""), changes, side)
 
     beside, off_by = view.few(window=False), BY_LINES
-    if not (by_lines := view.evaluator.by_lines(beside)):
+    by_lines = view.evaluator.by_lines(beside)
+    if not by_lines:
         beside, off_by = view.few(window=False, bands=ROUND), 1.0
     takes_psfs = by_lines or not view.evaluator.tabled(beside)
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
-    least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one else 0.0  # no less will do
+    least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one else 0.0  # less never does
     sides = [side for side in WINDOWS if max(2 * unseen, least) < side < largest]
     levels = [level(side, renormalise=False) for side in sides]
     top = Level(f"{view.window[0]} x {view.window[1]} px", {}, largest)
