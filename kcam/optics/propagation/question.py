@@ -203,7 +203,10 @@ class Query:
             known: dict[float, float] = _DISPLACEMENTS.get(asked, dict)  # by wavelength
             wavelengths = self.wavelengths.tolist()
             if missing := [index for index, wavelength in enumerate(wavelengths) if wavelength not in known]:
-                found = _ray_displacement(replace(self, wavelengths=self.wavelengths[missing]), share)
+                some = (
+                    self if len(missing) == len(wavelengths) else replace(self, wavelengths=self.wavelengths[missing])
+                )
+                found = _ray_displacement(some, share)
                 known.update(zip((wavelengths[index] for index in missing), found.tolist(), strict=True))
             return self.wavelengths.new_tensor([known[wavelength] for wavelength in wavelengths])
 
