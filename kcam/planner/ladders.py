@@ -290,7 +290,6 @@ def _support(view: _View) -> Iterator[Ladder]:
     by_lines = view.evaluator.by_lines(beside)
     if not by_lines:
         beside, off_by = view.few(window=False, bands=ROUND), 1.0
-    takes_psfs = by_lines or not view.evaluator.tabled(beside)
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
     least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one else 0.0  # less never does
     sides = [side for side in WINDOWS if max(2 * unseen, least) < side < largest]
@@ -308,7 +307,7 @@ def _support(view: _View) -> Iterator[Ladder]:
         alternatives=rescaled,
         off_by=off_by,
         from_top=view.evaluator.certain,
-        doubtful=view.one and takes_psfs,
+        doubtful=view.one and (by_lines or not view.evaluator.tabled(beside)),  # for what takes PSFs
     )
 
 

@@ -155,9 +155,9 @@ class Spectra:
         Returns: whether spectra tell of this scene, as `compare`.
         """
         border, imaging = self.imaging.border, self.optics.stage(settings)
-        for index, (rows, scene) in enumerate(self.groups):
-            light, vergences = self._light[rows], self._of(index, settings.get("layers")).vergences
-            shares = self._cutting(scene, settings.get("layers")).layers_of(scene, light)[1]
+        for rows, scene in self.groups:
+            light = self._light[rows]
+            vergences, shares = self._cutting(scene, settings.get("layers")).layers_of(scene, light)
             step = max(1, min(light.shape[-2:]) // _FRAMED)
             planes = functional.avg_pool2d(light if shares is None else light * shares, step)
             transfer = self.optics.of(imaging, vergences, scene.wavelengths, Way.LINES)[0].mean(1)

@@ -130,13 +130,14 @@ class Transfers:
         if known is None and way is not Way.PSFS:
             own = self._wider(imaging, vergences) if way is Way.WHOLE_LINES else imaging
             known = self.lines(own, vergences, wavelengths)
-        own_psfs = "PSFs", imaging.accuracy.recipe, tuple(vergences.tolist())
-        key = (own_psfs if known is None else id(known)), window, tuple(wavelengths.tolist())
+        how = (imaging.accuracy.recipe, *vergences.tolist()) if known is None else id(known)
+        key = how, window, tuple(wavelengths.tolist())
         if key not in self._sliced:
-            if known is None:
-                self._sliced[key] = self._of_psfs(imaging, vergences, wavelengths, window)
-            else:
-                self._sliced[key] = known(self.frequencies, window, wavelengths).cpu()
+            self._sliced[key] = (
+                self._of_psfs(imaging, vergences, wavelengths, window)
+                if known is None
+                else known(self.frequencies, window, wavelengths).cpu()
+            )
         found = self._sliced[key]
         return found / found[..., :1] if imaging.accuracy.renormalise else found
 
