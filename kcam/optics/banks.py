@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ OUTSIDE = 5e-3
 KEPT = 2e8  # bytes of PSFs that are kept
 _HALVINGS = 30
 
+T = TypeVar("T")
 OnAxis = Callable[[Tensor, Tensor, PixelGrid], Tensor]
 """PSFs (Z, L, h, w) of vergences (Z,), at wavelengths (L,), on pixels."""
 
@@ -36,13 +37,14 @@ class KnownPSFs:
 
     ends: wavelengths (2,) that are computed with those asked for, so that any part of a spectrum is computed alike.
     psfs: (h, w), by all that they depend on. windows: by what was asked. others: what else is known of the same optics,
-    see `keep`.
+    see `keep`. seen: of scenes, see `once`.
     """
 
     ends: Tensor
     psfs: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
     windows: dict[tuple[object, ...], tuple[int, int]] = field(default_factory=dict, repr=False)
     others: dict[tuple[object, ...], Any] = field(default_factory=dict, repr=False)
+    seen: dict[tuple[object, ...], tuple[object, Any]] = field(default_factory=dict, repr=False)
 
     def bank(self, how: object, vergences: Tensor, wavelengths: Tensor, pixels: PixelGrid, compute: OnAxis) -> Tensor:
         """PSFs (Z, L, h, w); how: what else they depend on."""
@@ -76,6 +78,14 @@ class KnownPSFs:
         value_of((*self.others.values(), value), tensors)
         if sum(tensor.nbytes for tensor in tensors) <= KEPT:
             self.others[key] = value
+
+    def once(self, parts: tuple[object, ...], how: object, look: Callable[[], T]) -> T:
+        """What a look at parts of a scene tells, which stay as they are and the same objects; how: and what else."""
+        key = *map(id, parts), how
+        if key not in self.seen:
+            self.seen[key] = parts, look()  # held, so that nothing else gets their place
+        found: T = self.seen[key][1]
+        return found
 
     def _holds(self, key: tuple[object, ...], shape: tuple[int, int]) -> bool:
         known = self.psfs.get(key)

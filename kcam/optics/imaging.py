@@ -204,7 +204,7 @@ class Imaging(Stage):
         if not self.varies and self._positions is None:
             ends = torch.stack(wavelengths.aminmax()) if getattr(self.lens, "symmetric", False) else wavelengths[:0]
             own.known = replace(
-                self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={}, windows={}
+                self._known_cache.get((self, wavelengths), lambda: KnownPSFs(ends)), psfs={}, windows={}, seen={}
             )
         return own
 
@@ -383,17 +383,26 @@ class Imaging(Stage):
         planes = scene.coefficients
         if self.accuracy.precision is not None:
             return planes.to(getattr(torch, self.accuracy.precision))
-        if planes.dtype == torch.float64 or wide_range(scene):
-            return planes.double()
-        return planes.float()
+        return planes.double() if planes.dtype == torch.float64 or self._wide(scene) else planes.float()
+
+    def _wide(self, scene: Scene) -> bool:
+        look = functools.partial(wide_range, scene)
+        return look() if self.known is None else self.known.once((scene.coefficients, scene.spectra), "range", look)
 
     def vergences(self, scene: Scene, depth: Tensor, *, wavelengths: Tensor | None = None) -> Tensor:
         """Of the layers that a scene is cut into, (Z,) [1/m]: half as far apart where a few lights stand out, whose own
         blur is seen, not its mean. wavelengths: (L,) [m] that ask for them; None for the scene's.
         """
-        fine = depth.numel() > 1 and wide_range(scene)
         light = scene.wavelengths if wavelengths is None else wavelengths
-        return self.depth_layers(depth, light, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
+
+        def cut() -> Tensor:
+            fine = depth.numel() > 1 and self._wide(scene)
+            return self.depth_layers(depth, light, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
+
+        if self.known is None or differentiated(depth):
+            return cut()
+        how = self.accuracy.layers, self.accuracy.blur, depth.device, tuple(light.tolist())
+        return self.known.once((scene.coefficients, scene.depth), how, cut)
 
     def layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vergences of the layers in which there is anything, (Z,) [1/m], and the share of each pixel in them,

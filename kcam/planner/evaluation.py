@@ -229,8 +229,15 @@ class Evaluator:
         """How many times as large an error of light without blur may be beside what blur leaves of it: of a few lights
         whose error is in what lies around them. Trials that are tried together at last need not know.
         """
-        told = {name: value for name, value in self._looked.items() if name in LINEAR}
+        if self.dimmed:
+            return max(self.dimmed)
+        told = {name: value for name, value in self._looked.items() if name in LINEAR - {"kappa"}}
         return max((row for spectra in self.spectra or () for row in spectra.dimmed(told)), default=1.0)
+
+    def error_of(self, off: float) -> float:
+        """The error of transfer functions that are off by so much of all light at most, at any frequency."""
+        unlike = max((spectra.unlike for spectra in self.spectra or ()), default=1.0)
+        return off * self._dimming * math.sqrt(unlike) * max(self.lost.values(), default=1.0)
 
     @functools.cached_property
     def hidden(self) -> list[float]:

@@ -30,6 +30,9 @@ FINE = 7e-3
 LITTLE = 1 / 2
 """Of the error that there may be, that a rough estimate may be at its largest and be taken."""
 
+SMALL = 0.4
+"""The same of what is said of all optics."""
+
 
 @dataclass(frozen=True)
 class Level:
@@ -58,6 +61,7 @@ class Ladder:
     seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`),
     by `most`, what was allowed when it was last priced.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
+    bounds: errors that rungs have at most, by their position: where so much is `SMALL`, it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     urgency: how much more its error counts than others' where the next ladder to climb is chosen.
     """
@@ -77,6 +81,7 @@ class Ladder:
     marks: tuple[int, ...] = ()
     seams: Callable[[Level], float] | None = None
     least: float = 0.0
+    bounds: dict[int, float] = field(default_factory=dict)
     doubtful: bool = False
     urgency: float = 1.0
     most: float = math.inf
@@ -114,6 +119,11 @@ class Ladder:
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
 
+    def bounded(self, most: float) -> int:
+        """The lowest rung that may be taken unseen where there may be so much error, or the top."""
+        top = len(self.levels) - 1
+        return min((place for place, bound in self.bounds.items() if bound <= SMALL * most), default=top)
+
     @property
     def _followed(self) -> int:
         """The rung of the ladder that it follows, if any, or one that tells as much."""
@@ -147,6 +157,8 @@ class Ladder:
             return
         if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing, one PSF has one colour
             self.errors[key] = 0.0
+        elif position in self.bounds and self.bounds[position] <= SMALL * most:
+            self.errors[key] = self.bounds[position]
         elif self.successive:
             self.errors[key] = self._beyond(evaluator)
         elif self.from_top and self.off_by > 1:

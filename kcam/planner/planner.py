@@ -22,13 +22,14 @@ from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_r
 from kcam.planner.prices import Prices
 from kcam.planner.range import Range
 from kcam.planner.skips import Skip, shortcuts_of
+from kcam.planner.spectra import few_lights
 from kcam.scene import Scene
 from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free
 
-WORTH, WORTH_DEEP = 0.2, 0.3
-"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, and with a
-map of depth; each picture of a batch adds an eighth: measured.
+WORTH, WORTH_DEEP, WORTH_LIGHTS = 0.2, 0.3, 0.7
+"""Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, with a map of
+depth, and of a few lights that stand out; each picture of a batch adds an eighth: measured.
 """
 
 SENSOR = "sensor"
@@ -124,11 +125,12 @@ class Planner:
     @property
     def pays(self) -> bool:
         """Whether a plan for a single picture takes less time than it saves: see `shoot`."""
-        imaging = self.evaluator.imaging
-        if imaging is None or self.evaluator.varies:
+        scene, imaging = self.prices.scene, self.evaluator.imaging
+        if imaging is None or self.evaluator.varies or not scene.coefficients.numel():
             return False
-        scene = self.prices.scene
         worth = WORTH_DEEP if is_deep(scene) else WORTH
+        if bool(few_lights(scene.coefficients.detach().sum(1, keepdim=True)).all()):
+            worth = WORTH_LIGHTS
         usual = self.prices.rates | costs.RATES  # on a slower machine a plan takes longer, too
         return costs.seconds(self.prices.work({}), usual) > worth * (1 + scene.shape[0] / 8)
 
@@ -196,12 +198,13 @@ class Planner:
         if self.evaluator.certain:
             ways: list[Any] = [*steps, *counted]
             doubtful = [ladder for ladder in steps if ladder.doubtful and self.one]
-            for ladder in doubtful:
-                ladder.position = len(ladder.levels) - 1
+            for ladder in steps:
+                if ladder.bounds or (ladder.doubtful and self.one):
+                    ladder.position = ladder.bounded(allowed / UNTRIED)
             _climb(steps, counted, self.evaluator, allowed / UNTRIED)
             for ladder in doubtful:
                 before, places = _changes(steps), [way.position for way in ways]
-                if self.prices.worth(ladder, before):
+                if ladder.position > 0 and self.prices.worth(ladder, before):
                     ladder.position = 0
                     _climb(steps, counted, self.evaluator, allowed / UNTRIED)
                     if self.prices.of(_changes(steps))[0] > self.prices.of(before)[0]:  # others climbed for it

@@ -322,9 +322,7 @@ class Spectra:
     @functools.cached_property
     def few_lights(self) -> Tensor:
         """Whether a few pixels, or patches, have most of the energy of a row, (B,)."""
-        patches = functional.avg_pool2d(self._light, min(_PATCH, *self._light.shape[-2:]), ceil_mode=True)
-        few = torch.minimum(_lights(self._light), _lights(patches)) < _FEW
-        return few & (self._light.flatten(1).amax(1) > 0).cpu()
+        return few_lights(self._light)
 
     @functools.cached_property
     def _replaced(self) -> Tensor:
@@ -462,6 +460,13 @@ def _compressed(scene: Scene) -> Scene:
             with contextlib.suppress(ValueError):  # light would be negative somewhere, by more than a scene lets pass
                 return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, spectra @ few), spectra=few.T)
     return scene
+
+
+def few_lights(light: Tensor) -> Tensor:
+    """Whether a few pixels, or patches, have most of the energy of light (B, 1, H, W): (B,)."""
+    patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
+    few = torch.minimum(_lights(light), _lights(patches)) < _FEW
+    return few & (light.flatten(1).amax(1) > 0).cpu()
 
 
 def _lights(light: Tensor) -> Tensor:

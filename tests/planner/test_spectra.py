@@ -13,7 +13,7 @@ import scipy
 import torch
 from draws import Draw
 
-from benchmarks.pairs import hard_pair, random_pair
+from benchmarks.pairs import assorted_pair, hard_pair, random_pair
 from kcam import Camera, Scene, optics, sensor
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.radial import RADIAL
@@ -22,9 +22,9 @@ from kcam.planner import Planner, costs, cross_spectra, evaluation, noiseless_ra
 from kcam.planner import spectra as spectra_module
 from kcam.planner.band_counts import group_counts, interpolated, node_counts
 from kcam.planner.evaluation import Evaluator, _error
-from kcam.planner.ladder import LITTLE, ORDERS, Ladder, Level
+from kcam.planner.ladder import LITTLE, ORDERS, SMALL, Ladder, Level
 from kcam.planner.ladders import FASTEST, MARKS, QUADRATURE
-from kcam.planner.plan import with_imaging
+from kcam.planner.plan import UNTRIED, with_imaging
 from kcam.planner.spectra import Care, Spectra, _compressed
 from kcam.units import mm, nm, um, wavelength_grid
 
@@ -155,16 +155,45 @@ def test_transfer_functions_of_layers_lie_between_those_of_more(seed: int, monke
 
 @pytest.mark.parametrize(("seed", "asked"), [(10, True), (208, True), (188, False), (174, False)])
 def test_a_single_picture_prices_what_pays(seed: int, asked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples of the pupil, once it is known how many PSFs are left."""
+    """Samples of the pupil, once it is known how many PSFs are left; else as few as may be taken unseen."""
     camera, scene, *_ = random_pair(seed)
     with torch.no_grad():
         planner = Planner(camera, scene, one=True)
         monkeypatch.setattr(planner.prices, "rates", costs.RATES)
         changes = planner.plan(0.01).changes
     (samples,) = (ladder for ladder in planner._known[0] if ladder.effect == "pupil samples")
-    assert bool(samples.errors or any(samples.roughly.values())) == asked
-    assert asked or samples.why() == "would save less time than it takes to find out"
-    assert asked or "kappa" not in changes
+    assert any(samples.roughly.values()) == asked
+    unseen = samples.bounded(0.01 / UNTRIED)
+    assert asked or samples.position == unseen
+    assert asked or samples.error == samples.bounds[unseen] <= SMALL * 0.01 / UNTRIED
+    assert asked or changes["kappa"] == samples.levels[unseen].fineness
+
+
+@pytest.mark.filterwarnings("ignore:f/.* is outside")
+@pytest.mark.parametrize(
+    ("pair", "first"),
+    [
+        (random_pair, 90),
+        (assorted_pair, 80),
+        *(pytest.param(pair, n, marks=pytest.mark.slow) for pair in (random_pair, assorted_pair) for n in (0, 30, 60)),
+    ],
+)
+def test_what_coarse_pupils_cost_is_bounded(pair: Callable[..., tuple], first: int) -> None:
+    """Of smooth pupils, and of maps of pixels in round ones, by what blur leaves of the light."""
+    told = 0
+    for seed in range(first, first + (30 if first < 80 else 10)):
+        camera, scene, *_ = pair(seed)
+        planner = Planner(camera, scene, one=True)
+        if planner.prices.of({})[0] > 1:
+            continue
+        with torch.no_grad():
+            for ladder in planner._ways()[0]:
+                against = ladder.beside | {"bands": 4}
+                against.pop("propagator", None)
+                for place, bound in ladder.bounds.items():
+                    assert planner.evaluator.error(against | ladder.levels[place].changes, against) <= bound, seed
+                    told += 1
+    assert told > 3
 
 
 @pytest.mark.parametrize("seed", [10, 188, 31, 29])
