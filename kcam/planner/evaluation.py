@@ -25,9 +25,10 @@ from kcam.effects import Skippable
 from kcam.optics import Imaging, Lens
 from kcam.optics.rendering.place import Place
 from kcam.optics.source import Defocus
+from kcam.planner.light import linear
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
 from kcam.planner.samples import Sample, samples_of
-from kcam.planner.spectra import LINEAR, Care, Spectra, linear
+from kcam.planner.spectra import LINEAR, Care, Spectra
 from kcam.planner.survey import BEYOND, TILE, Survey, stops, survey
 from kcam.scene import Scene
 from kcam.sensor import ADC, ColourFilter, Mosaic, Transmission

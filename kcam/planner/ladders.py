@@ -51,11 +51,11 @@ were 0.52 to 3.1 times the others, and of 150, where they were above `COARSE`, 0
 COARSE = 2e-4
 """Of pupil samples at one wavelength, which may have the same grid either way, where others have not."""
 
-KAPPAS, KAPPAS_OF_PIXELS = {1.3: 1.3e-3, 1.7: 8e-4, 2.1: 3e-4}, {1.7: 1.8e-3, 1.9: 3.5e-4}
+KAPPAS, KAPPAS_OF_PIXELS = {1.3: 1.3e-3, 1.7: 8e-4, 2.1: 3e-4}, {1.7: 4e-3, 1.9: 1.4e-3, 2.1: 3.5e-4}
 """Pupil samples for each fringe, and how far off transfer functions then are, of all light: see `Evaluator.error_of`.
 Pictures erred at most 1.0e-3, 7.3e-4 and 2.3e-4 times what all of the light would, of 117 random pairs with smooth
-pupils, round, square and annular; and 1.4e-3 and 2.6e-4 of 190 with maps of pixels in round ones, of more than
-`FEWEST` samples.
+pupils, round, square and annular; and 3.1e-3, 1.1e-3 and 2.6e-4 of 250 with maps of pixels in round ones, of more than
+`FEWEST` samples, the noisy ones most.
 """
 
 FEWEST = 64

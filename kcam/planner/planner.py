@@ -18,11 +18,11 @@ from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladder import Ladder
 from kcam.planner.ladders import ladders
+from kcam.planner.light import few_lights
 from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_raw, shortened, together
 from kcam.planner.prices import Prices
 from kcam.planner.range import Range
 from kcam.planner.skips import Skip, shortcuts_of
-from kcam.planner.spectra import few_lights
 from kcam.scene import Scene
 from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free

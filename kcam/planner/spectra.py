@@ -12,7 +12,6 @@ of it where that is much.
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import functools
 import math
@@ -25,20 +24,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from kcam.camera import Camera
-from kcam.isp import Clip
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
-from kcam.optics.numerics import bracketed, cubic_weights
-from kcam.optics.rendering.borders import extend
+from kcam.optics.numerics import cubic_weights
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.cross_spectra import cross_spectra
+from kcam.planner.light import UNSEEN, blurred, compressed, few_lights, lights, recorded
 from kcam.planner.transfers import GROUPS, Transfers, Way
 from kcam.scene import Scene
-from kcam.sensor import ColourFilter, DarkCurrent, Exposure, Mosaic, ReadNoise, ShotNoise, Transmission
-from kcam.sensor.mosaic import pattern_tile
-from kcam.sensor.random_stage import Mean
 
 LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
 LINEAR |= {"layers", "occlusion"}
@@ -66,11 +61,8 @@ _MOST = 0.9  # of the light, that a window must hold through which it is looked 
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _OUTSIDE = 1.4  # times what products of line spreads say is lost beyond borders: 0.9 to 1.6 of 13 that lose 3 %
 _FRAMED = 64  # pixels of the shorter side, of which there are as many again, that tell what falls into the picture
-_PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
 _BETWEEN_LAYERS = 4  # times as many layers as there are in a setting, between whose transfer functions its own lie
 _SAME_LAYER = 1e-6  # of the range of depth
-_UNSEEN = 1e-8  # of what is recorded, sums over the bands that do not count
-_WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
 
 
 @dataclass(frozen=True)
@@ -116,8 +108,8 @@ class Spectra:
         cls, camera: Camera, imaging: Imaging, scene: Scene, *, picture: tuple[int, int], hidden: Tensor | None = None
     ) -> Spectra:
         """Those before a camera."""
-        light = _compressed(scene)
-        return cls(Transfers(imaging, light, picture), light, _recorded(camera, scene), hidden=hidden)
+        light = compressed(scene)
+        return cls(Transfers(imaging, light, picture), light, recorded(camera, scene), hidden=hidden)
 
     def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> bool:
         """Take what pixels truly record with some settings, the energy of each row (B,), for what errors are relative
@@ -161,9 +153,9 @@ class Spectra:
             step = max(1, min(light.shape[-2:]) // _FRAMED)
             planes = functional.avg_pool2d(light if shares is None else light * shares, step)
             transfer = self.optics.of(imaging, vergences, scene.wavelengths, Way.LINES)[0].mean(1)
-            inside, everywhere = _blurred(planes, transfer, self.frequencies * step, border)
+            inside, everywhere = blurred(planes, transfer, self.frequencies * step, border)
             if border != "zero":
-                everywhere, _ = _blurred(planes, transfer, self.frequencies * step, "reflect")
+                everywhere, _ = blurred(planes, transfer, self.frequencies * step, "reflect")
             framed = (inside / everywhere.clamp(min=1e-300)).clamp(min=1e-3)
             self._framed[rows] = 1 / (1 + _OUTSIDE * (1 / framed - 1)).clamp(min=1e-3)
         self._unlike = (self._unlike / self._framed).clamp(min=1)
@@ -185,7 +177,7 @@ class Spectra:
         stage, few = self.optics.stage({"bands": FEW_BANDS}), self.optics.few
         shares = stage.shares(self.wavelengths)
         much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
-        light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=_UNSEEN)[None].to(self._light)
+        light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=UNSEEN)[None].to(self._light)
         grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
         return Spectra(self.optics, grey, None)
 
@@ -317,7 +309,7 @@ class Spectra:
         """What the energy of a difference may be, of that in the mean over directions, (B,): more by 1 over the number
         of lights, if few have most of the energy. Their spectrum is even: it shows the corners of a window.
         """
-        return 1 + 1 / _lights(self._light)
+        return 1 + 1 / lights(self._light)
 
     @functools.cached_property
     def few_lights(self) -> Tensor:
@@ -423,84 +415,3 @@ def _among(vergences: Tensor, others: Tensor) -> bool:
         return True
     apart = (vergences[:, None] - others).abs().amin(1)
     return bool((apart <= _SAME_LAYER * (others.max() - others.min())).all())
-
-
-def _blurred(planes: Tensor, transfer: Tensor, frequencies: Tensor, border: str) -> tuple[Tensor, Tensor]:
-    """Energy of light in layers (B, Z, H, W), blurred by transfer functions along x and y (Z, 2, F) at frequencies
-    (F,): in the picture, and with as much again around it, (B,).
-    """
-    height, width = planes.shape[-2:]
-    light = torch.fft.rfft2(extend(planes, (height + 1, width + 1), border))
-    for axis, own in enumerate((torch.fft.rfftfreq(2 * width), torch.fft.fftfreq(2 * height))):
-        low, share = bracketed(frequencies, own.abs().to(frequencies))
-        along = torch.lerp(transfer[:, axis, low], transfer[:, axis, low + 1], share.to(transfer.dtype))
-        along = torch.where(own < 0, along.conj(), along).to(light)
-        light = light * (along[:, :, None] if axis else along[:, None])
-    seen = torch.fft.irfft2(light.sum(1), s=(2 * height, 2 * width)).square()
-    inside = seen.narrow(1, (height + 1) // 2, height).narrow(2, (width + 1) // 2, width)
-    return inside.sum((1, 2)).double().cpu(), seen.sum((1, 2)).double().cpu()
-
-
-def _compressed(scene: Scene) -> Scene:
-    """The scene as planes of the fewest spectra that leave out `_WHOLE` of its light at most: of its square root, so
-    that the rest counts beside a few bright lights, and dim items beside bright ones.
-    """
-    planes = scene.coefficients.detach()
-    planes = planes.to(torch.promote_types(planes.dtype, torch.float32))
-    spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).to(planes)
-    onto_light = torch.linalg.qr(spectra.T).R  # as long as the radiance
-    light = torch.einsum("lk,bkhw->blhw", onto_light, planes).square().sum(1, keepdim=True).sqrt()
-    light = light.clamp(min=torch.finfo(planes.dtype).tiny)
-    flat = (planes / light.sqrt() / light.sum((-2, -1), keepdim=True).sqrt()).transpose(0, 1).flatten(1)
-    energies, directions = torch.linalg.eigh((spectra.T @ (flat @ flat.T) @ spectra).double())
-    left_out = energies.clamp(min=0).cumsum(0)
-    for share in _WHOLE:
-        few = directions[:, int((left_out[:-1] <= share**2 * left_out[-1]).sum()) :].to(planes)
-        if few.shape[1] < len(flat):
-            with contextlib.suppress(ValueError):  # light would be negative somewhere, by more than a scene lets pass
-                return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, spectra @ few), spectra=few.T)
-    return scene
-
-
-def few_lights(light: Tensor) -> Tensor:
-    """Whether a few pixels, or patches, have most of the energy of light (B, 1, H, W): (B,)."""
-    patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
-    few = torch.minimum(_lights(light), _lights(patches)) < _FEW
-    return few & (light.flatten(1).amax(1) > 0).cpu()
-
-
-def _lights(light: Tensor) -> Tensor:
-    """How many pixels have most of the energy of each (B, 1, H, W): (B,), from 1 on."""
-    energies = light.double().flatten(1).cpu().square()
-    return (energies.sum(1).square() / energies.square().sum(1).clamp(min=1e-300)).clamp(min=1)
-
-
-def linear(camera: Camera) -> bool:
-    """Whether a camera's noiseless raw is linear in light that is not clipped, and its PSF one all over."""
-    known = (Clip, ColourFilter, DarkCurrent, Exposure, Imaging, Mosaic, ReadNoise, ShotNoise, Transmission)
-    stages = [stage.stage if isinstance(stage, Mean) else stage for stage in camera]
-    one = all(getattr(stage.lens, "positions", None) is None for stage in stages if isinstance(stage, Imaging))
-    return one and all(isinstance(stage, known) for stage in stages)
-
-
-def _recorded(camera: Camera, scene: Scene) -> Tensor | None:
-    """Sums over the bands (R, L) whose squares add up to what a pixel records, in the mean over pixels; None: bands."""
-    weights, pairs = None, None
-    for stage in camera:
-        if isinstance(stage, ColourFilter):
-            seen: Any = camera.resolve(scene).colour_filter  # the same, behind what stands before it
-            weights = seen.contraction(scene.wavelengths).detach().double().cpu()
-            pairs = torch.eye(len(weights), dtype=torch.float64)
-            if stage.is_tile:
-                alpha = stage.alpha().detach().double().cpu().flatten(0, 1)
-                pairs = alpha.T @ alpha / len(alpha)
-        elif isinstance(stage, Mosaic):
-            tile = pattern_tile(stage.pattern).flatten()
-            count = len(scene.wavelengths) if weights is None else len(weights)
-            pairs = tile.bincount(minlength=count).double().diag() / len(tile)
-    if pairs is None:
-        return None
-    sizes, sums = torch.linalg.eigh(pairs)
-    seen = sizes > _UNSEEN * sizes[-1]
-    sums = (sums[:, seen] * sizes[seen].sqrt()).T
-    return sums if weights is None else sums @ weights

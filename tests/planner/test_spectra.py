@@ -24,8 +24,9 @@ from kcam.planner.band_counts import group_counts, interpolated, node_counts
 from kcam.planner.evaluation import Evaluator, _error
 from kcam.planner.ladder import LITTLE, ORDERS, SMALL, Ladder, Level
 from kcam.planner.ladders import FASTEST, MARKS, QUADRATURE
+from kcam.planner.light import compressed
 from kcam.planner.plan import UNTRIED, with_imaging
-from kcam.planner.spectra import Care, Spectra, _compressed
+from kcam.planner.spectra import Care, Spectra
 from kcam.units import mm, nm, um, wavelength_grid
 
 CHANGES = [
@@ -584,7 +585,7 @@ def test_fewer_planes_hold_the_light(seed: int) -> None:
     light = Scene(planes, spectra, grid, 2.0)
     if draw.one_of(True, False):
         light = Scene.from_bands(light.bands(), wavelengths=grid, depth=2.0)
-    found = _compressed(light)
+    found = compressed(light)
     assert found.coefficients.shape[1] <= light.coefficients.shape[1]
     brightness = light.bands().norm(dim=1, keepdim=True).clamp(min=1e-30).sqrt()
     off, whole = (
