@@ -6,7 +6,8 @@ What a value is, is decided here, once, for everything that a lens or a stage ca
 - tuples, lists, dicts and sets by what is in them;
 - modules of kcam and torch.nn by their class and by all that they hold, plain attributes and torch's own alike; so are
   kcam's dataclasses;
-- kcam's functions by their code and what they closed over.
+- kcam's functions by their code and what they closed over;
+- what only remembers results (`remembers`) by its class.
 
 What else there is cannot be known, and then nothing is kept and all is computed again: other objects and functions
 (hooks and methods put onto an instance among them), tensors of other kinds, parametrizations, which may draw, and
@@ -70,6 +71,8 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
             raise Unknown(f"a {kind.__name__} that is not plain")
         tensors.append(thing)
         return kind, thing.dtype, thing.device, thing.shape, thing.requires_grad
+    if kind is ValueCache or (_ours(kind) and getattr(kind, "remembers", False)):
+        return kind  # what is kept changes no result
     if id(thing) in within:
         raise Unknown(f"a {kind.__name__} that holds itself")
     within = (*within, id(thing))
@@ -93,8 +96,6 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
     if where.startswith("kcam."):
         closed = [cell.cell_contents for cell in thing.__closure__ or ()]
         return where, thing.__code__, each((thing.__defaults__, thing.__kwdefaults__, closed))
-    if kind is ValueCache:
-        return kind
     raise Unknown(kind.__name__)
 
 

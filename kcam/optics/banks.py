@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -39,6 +39,8 @@ class KnownPSFs:
     psfs: (h, w), by all that they depend on. windows: by what was asked. others: what else is known of the same optics,
     see `keep`. seen: of scenes, see `once`.
     """
+
+    remembers: ClassVar[bool] = True  # and is no part of what a stage is, see `cache.value_of`
 
     ends: Tensor
     psfs: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)

@@ -23,7 +23,10 @@ from kcam.sensor.random_stage import Mean
 UNSEEN = 1e-8
 """Of what is recorded, sums over the bands that do not count."""
 
-_PATCH, _FEW = 4, 64  # side of patches of light [pixels], and how many are few
+FEW = 64
+"""Pixels, or patches, that are few."""
+
+_PATCH = 4  # side of patches of light [pixels]
 _WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
 
 
@@ -82,7 +85,7 @@ def compressed(scene: Scene) -> Scene:
 def few_lights(light: Tensor) -> Tensor:
     """Whether a few pixels, or patches, have most of the energy of light (B, 1, H, W): (B,)."""
     patches = functional.avg_pool2d(light, min(_PATCH, *light.shape[-2:]), ceil_mode=True)
-    few = torch.minimum(lights(light), lights(patches)) < _FEW
+    few = torch.minimum(lights(light), lights(patches)) < FEW
     return few & (light.flatten(1).amax(1) > 0).cpu()
 
 

@@ -18,7 +18,7 @@ from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
 from kcam.planner.ladder import Ladder
 from kcam.planner.ladders import ladders
-from kcam.planner.light import few_lights
+from kcam.planner.light import FEW, lights
 from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_raw, shortened, together
 from kcam.planner.prices import Prices
 from kcam.planner.range import Range
@@ -129,8 +129,8 @@ class Planner:
         if imaging is None or self.evaluator.varies or not scene.coefficients.numel():
             return False
         worth = WORTH_DEEP if is_deep(scene) else WORTH
-        if bool(few_lights(scene.coefficients.detach().sum(1, keepdim=True)).all()):
-            worth = WORTH_LIGHTS
+        if bool((lights(scene.coefficients.detach().sum(1, keepdim=True)) < FEW).all()):
+            worth = max(worth, WORTH_LIGHTS)
         usual = self.prices.rates | costs.RATES  # on a slower machine a plan takes longer, too
         return costs.seconds(self.prices.work({}), usual) > worth * (1 + scene.shape[0] / 8)
 

@@ -15,6 +15,7 @@ from draws import Draw
 
 from benchmarks.pairs import assorted_pair, hard_pair, random_pair
 from kcam import Camera, Scene, optics, sensor
+from kcam.cache import value_of
 from kcam.optics.imaging import is_deep
 from kcam.optics.propagation.radial import RADIAL
 from kcam.optics.source import PixelGrid, Points
@@ -195,6 +196,19 @@ def test_what_coarse_pupils_cost_is_bounded(pair: Callable[..., tuple], first: i
                     assert planner.evaluator.error(against | ladder.levels[place].changes, against) <= bound, seed
                     told += 1
     assert told > 3
+
+
+def test_what_a_plan_keeps_is_no_part_of_what_a_stage_is() -> None:
+    """Else each picture would copy and compare the whole scene."""
+    camera, scene, *_ = random_pair(146)
+    with torch.no_grad():
+        planner = Planner(camera, scene, one=True)
+        before, after = [], []
+        value = value_of(planner.evaluator.imaging, before)
+        planner.plan(0.01)
+        assert planner.evaluator.imaging.known.seen
+        assert value_of(planner.evaluator.imaging, after) == value
+    assert [id(tensor) for tensor in after] == [id(tensor) for tensor in before]
 
 
 @pytest.mark.parametrize("seed", [10, 188, 31, 29])
