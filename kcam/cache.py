@@ -71,7 +71,7 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
             raise Unknown(f"a {kind.__name__} that is not plain")
         tensors.append(thing)
         return kind, thing.dtype, thing.device, thing.shape, thing.requires_grad
-    if kind is ValueCache or (_ours(kind) and getattr(kind, "remembers", False)):
+    if getattr(kind, "remembers", False) is True and _ours(kind):
         return kind  # what is kept changes no result
     if id(thing) in within:
         raise Unknown(f"a {kind.__name__} that holds itself")
@@ -185,6 +185,8 @@ class ValueCache:
 
     entries: how many.
     """
+
+    remembers = True  # see `value_of`
 
     _kept: tuple[tuple[Any, tuple[Tensor, ...], Any], ...] = ()  # set and read at once: other threads use it too
 

@@ -131,7 +131,8 @@ def test_shoot_within_a_tolerance(photo: Path, tmp_path: Path, monkeypatch: pyte
     assert whole.read_bytes() == planned.read_bytes()
     monkeypatch.setattr("kcam.planner.planner.WORTH", 0.0)
     _, left_out = run("shoot", photo, "--camera", "thesis", "--out", planned).splitlines()
-    assert re.match(r"  within 0.01: .*wavelengths \d+ PSFs \(of 28 PSFs\)", left_out)
+    coarser = r"pupil samples kappa [\d.]+ \(of kappa 2\.7\)"
+    assert re.match(rf"  within 0.01: {coarser}, wavelengths \d+ PSFs \(of 28 PSFs\)", left_out)
     one, two = (np.asarray(Image.open(path)).astype(float) for path in (whole, planned))
     assert 0 < np.abs(one - two).max() < 12
     assert "is no relative error: expected e.g. 0.01, or sensor" in fails("shoot", photo, "--tolerance", "fine")

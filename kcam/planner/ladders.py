@@ -59,6 +59,7 @@ pupils, round, square and annular; and 3.1e-3, 1.1e-3 and 2.6e-4 of 250 with map
 """
 
 FEWEST = 64
+"""Pupil samples of any grid under a map of pixels, at least: fewer for each fringe then save nothing."""
 
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""

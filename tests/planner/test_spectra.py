@@ -165,6 +165,7 @@ def test_a_single_picture_prices_what_pays(seed: int, asked: bool, monkeypatch: 
         changes = planner.plan(0.01).changes
     (samples,) = (ladder for ladder in planner._known[0] if ladder.effect == "pupil samples")
     assert any(samples.roughly.values()) == asked
+    assert asked or samples.why() == "would save less time than it takes to find out"
     unseen = samples.bounded(0.01 / UNTRIED)
     assert asked or samples.position == unseen
     assert asked or samples.error == samples.bounds[unseen] <= SMALL * 0.01 / UNTRIED
