@@ -22,6 +22,7 @@ from kcam.units import mm, um, wavelength_grid
 
 WAYS = {"direct": {"direct": True}, "tiles": {"tile": 8}, "one tile": {"tile": 64}, "odd tiles": {"tile": 13}}
 CONTENTS = {"bands": (None, None), "filter": (None, 2), "kernels": (2, 2), "spectra": (5, 2), "planes": (5, None)}
+CONTENTS |= {"tile": (2, 7), "grey": (1, None)}  # fewer planes than channels
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

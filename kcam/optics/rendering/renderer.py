@@ -31,16 +31,26 @@ class Renderer(Bank):
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
-        bank, psfs = self._of_masks, self.psfs[layer]
-        if self.weights is None:
-            kernels = self.of_bands(psfs)
-        else:
-            kernels = torch.einsum("cg,gyx->cyx", self.grouped(self.weights), psfs)
-        kernels = kernels / kernels.sum((-2, -1), keepdim=True)
+        bank, kernels = self._of_masks, self.psfs[layer]
+        if self.weights is not None and not self._few:
+            kernels = torch.einsum("cg,gyx->cyx", self.grouped(self.weights), kernels)
+        sums = kernels.sum((-2, -1))
+        if not self._few:
+            kernels = kernels / sums[:, None, None]
         if self.direct:
-            return correlate(bank.extend(share), kernels[:, None])
-        convolution, transfers = bank.convolution, bank.convolution.transfer(kernels)
-        return bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
+            spread = correlate(bank.extend(share), kernels[:, None])
+        else:
+            convolution, transfers = bank.convolution, bank.convolution.transfer(kernels)
+            spread = bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
+        if not self._few:
+            return spread
+        mixing = self.grouped(self.kappa())
+        return torch.einsum("cg,bghw->bchw", mixing / (mixing @ sums)[:, None], spread)
+
+    @property
+    def _few(self) -> bool:
+        """Whether there are fewer PSFs than channels, so that masks are spread by these."""
+        return self.groups < self.channels
 
     def near(self, place: Place, *, batch: int) -> Renderer | None:
         """The renderer of what a layer reaches from its place, to which `around` brings what lies around; None where
@@ -91,28 +101,30 @@ class Renderer(Bank):
 
     def work(self, *, batch: int, coverage: bool) -> Work:
         """What one layer of a batch takes, with its coverage or without; of tensors the shapes are enough."""
-        inputs, kernels, products, *_, held, touched, contracted = choose(self, batch).takes(self)
+        inputs, kernels, back, products, *_, held, touched, contracted = choose(self, batch).takes(self)
         points, pixels, kernel = (math.prod(size) for size in (self.sizes.size, self.picture, self.window))
         tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
-        if coverage and self.weights is not None:
+        spread = min(out, self.groups)  # of each mask
+        if coverage and self.weights is not None and not self._few:
             contracted += out * self.groups * kernel
         if self.direct:
-            summed = products + (2 * out if coverage else 0)
+            summed = products + (2 * spread if coverage else 0)
             slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
-            memory = float(itemsize * (2 * inputs * pixels + summed * kernel + out * pixels))
+            memory = float(itemsize * (2 * inputs * pixels + summed * kernel + back * pixels))
             touched += float((inputs + 2 * out) * pixels)
             operations = {"product": float(batch * summed * pixels * kernel * slow)}
             return Work(operations | {"touch": batch * touched + contracted}, batch * memory)
-        transforms = float(batch * tiles * (inputs + out) + kernels)  # those of the PSFs once
-        touched += float(tiles * points * (inputs + out + products))
+        transforms = float(batch * tiles * (inputs + back) + kernels)  # those of the PSFs once
+        touched += float(tiles * points * (inputs + back + products))
         contracted += kernels * points
         if coverage:
             ratio = math.prod(self._of_masks.sizes.size) / points
-            transforms += ratio * (batch * tiles * 2 * (1 + out) + out)
-            touched += ratio * tiles * points * 2 * (1 + 3 * out) + 6 * out * pixels
-        memory = float(batch * itemsize * (held * points + (inputs + out) * pixels))
+            transforms += ratio * (batch * tiles * 2 * (1 + spread) + spread)
+            touched += ratio * tiles * points * 2 * (1 + 3 * spread) + 6 * out * pixels
+            touched += 2 * out * self.groups * pixels / 8 if self._few else 0.0
+        memory = float(batch * itemsize * (held * points + (inputs + back) * pixels))
         operations = {"transform": transforms * points * math.log2(max(2, points))}
         operations["touch"] = batch * touched + contracted
         if pixels > _NEAR:  # whole it is touched again and again in far memory, in tiles once
-            operations["large"] = float(batch * pixels * (inputs + out) * (2 if tiles == 1 else 1))
+            operations["large"] = float(batch * pixels * (inputs + back) * (2 if tiles == 1 else 1))
         return Work(operations, memory)

@@ -3,7 +3,7 @@
     I_c = sum_l kappa_cl (I_l * h_l),   I_l = sum_k S_kl C_k
 
 The sum over wavelengths stands *inside* the Fourier transform: the picture is transformed once per plane of the scene's
-factors, and back once per channel, not once per band. To add a way, write what it does with a `Bank`, what it takes,
+factors, and back once per channel, not once per band; but of few planes and PSFs before many channels. To add a way, write what it does with a `Bank`, what it takes,
 and a row: the choice and a picture's work follow.
 """
 
@@ -130,8 +130,10 @@ class Takes(NamedTuple):
 
     inputs: int  # transformed
     kernels: int  # transformed
+    outputs: int  # transformed back
     products: int
-    cost: float  # of each picture, by which the way is chosen, in transforms; ten products take the time of one
+    cost: float  # of each picture, by which the way is chosen, in transforms beside those back to the channels; ten
+    # products take the time of one
     once: float  # for a batch
     held: float  # in memory
     touched: float = 0.0
@@ -147,7 +149,7 @@ class Way(NamedTuple):
 
 def _each_takes(n: Bank) -> Takes:
     held = 4 + n.bands * prod(n.picture) / prod(n.sizes.size)
-    return Takes(n.bands, n.bands, n.bands, cost=0.0 if n.weights is None else inf, once=0.0, held=held)
+    return Takes(n.bands, n.bands, n.channels, n.bands, cost=0.0 if n.weights is None else inf, once=0.0, held=held)
 
 
 def _each(bank: Bank, psfs: Tensor) -> Blur:
@@ -177,7 +179,7 @@ def _groups_take(n: Bank) -> Takes:
     parts = n.channels * n.groups
     touched = parts * n.planes * prod(n.picture) / 8
     held = 3 * n.channels + n.groups
-    return Takes(parts, n.groups, parts, cost=parts, once=n.groups, held=held, touched=touched)
+    return Takes(parts, n.groups, n.channels, parts, cost=parts, once=n.groups, held=held, touched=touched)
 
 
 def _groups(bank: Bank, psfs: Tensor) -> Blur:
@@ -202,6 +204,32 @@ def _groups(bank: Bank, psfs: Tensor) -> Blur:
     return blur
 
 
+def _apart_takes(n: Bank) -> Takes:
+    parts = n.planes * n.groups
+    touched = n.channels * parts * prod(n.picture) / 8
+    cost, held = n.planes + parts - n.channels, n.planes + n.groups + 3 * parts
+    return Takes(n.planes, n.groups, parts, parts, cost=cost, once=n.groups, held=held, touched=touched)
+
+
+def _apart(bank: Bank, psfs: Tensor) -> Blur:
+    """sum_kg M_ckg (h_g C_k): before many channels each of few planes through each of few PSFs, contracted at last."""
+    mixing = bank.mixing()
+
+    def direct(planes: Tensor) -> Tensor:
+        found = correlate(bank.extend(planes).flatten(0, 1)[:, None], psfs[:, None])
+        return found.unflatten(0, planes.shape[:2])
+
+    if bank.direct:
+        return lambda planes: torch.einsum("ckg,bkghw->bchw", mixing, direct(planes))
+    convolution, transfers = bank.convolution, bank.transfers(lambda: psfs, bank.groups, psfs)
+
+    def blur(planes: Tensor) -> Tensor:
+        parts = convolution.back(convolution.transform(planes)[:, :, None] * transfers)
+        return torch.einsum("ckg,bkghw->bchw", mixing, parts)
+
+    return blur
+
+
 def _kernels_take(n: Bank) -> Takes:
     kernels = n.channels * n.planes
     few = kernels <= n.groups  # measured: the kernels' own contraction runs well
@@ -210,7 +238,7 @@ def _kernels_take(n: Bank) -> Takes:
         cost = inf
     contracted = kernels * n.groups * prod(n.window)
     held = n.planes + kernels + 3 + n.channels
-    return Takes(n.planes, kernels, kernels, cost=cost, once=once, held=held, contracted=contracted)
+    return Takes(n.planes, kernels, n.channels, kernels, cost=cost, once=once, held=held, contracted=contracted)
 
 
 def _kernels(bank: Bank, psfs: Tensor) -> Blur:
@@ -244,7 +272,7 @@ def _bands_take(n: Bank) -> Takes:
     products = n.bands * (1 + n.channels + (0 if n.spectra is None else n.planes))
     cost = inf if n.direct else n.planes + products / 10
     held = (at_once if n.spectra is None else n.planes) + at_once + 2 * n.channels
-    return Takes(n.planes, n.bands, products, cost=cost, once=n.bands, held=held)
+    return Takes(n.planes, n.bands, n.channels, products, cost=cost, once=n.bands, held=held)
 
 
 def _bands(bank: Bank, psfs: Tensor) -> Blur:
@@ -257,6 +285,7 @@ def _bands(bank: Bank, psfs: Tensor) -> Blur:
 WAYS = {
     "each": Way(_each_takes, _each),
     "groups": Way(_groups_take, _groups),
+    "apart": Way(_apart_takes, _apart),
     "kernels": Way(_kernels_take, _kernels),
     "bands": Way(_bands_take, _bands),
 }
