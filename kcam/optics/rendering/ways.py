@@ -3,8 +3,8 @@
     I_c = sum_l kappa_cl (I_l * h_l),   I_l = sum_k S_kl C_k
 
 The sum over wavelengths stands *inside* the Fourier transform: the picture is transformed once per plane of the scene's
-factors, and back once per channel, not once per band; but of few planes and PSFs before many channels. To add a way, write what it does with a `Bank`, what it takes,
-and a row: the choice and a picture's work follow.
+factors, and back once per channel, not once per band; but of few planes and PSFs before many channels. To add a way,
+write what it does with a `Bank`, what it takes, and a row: the choice and a picture's work follow.
 """
 
 from __future__ import annotations
