@@ -209,11 +209,12 @@ class Ladder:
         of their middles.
         """
         if self.marks:
-            return self._by_the_next(evaluator)
+            foretold = self._foretold(evaluator)
+            return self._by_the_next(evaluator, self.position) if foretold is None else foretold
         priced = {position for position, _ in self.errors}
         below = sorted(low for low in priced if STEP * self.levels[low].fineness <= self.level.fineness)[-2:]
         if not below:
-            return self._by_the_next(evaluator)
+            return self._by_the_next(evaluator, self.position)
         places = (*below, self.position)
         known = [self.beside | self.levels[position].changes for position in places]
         steps = [evaluator.error(below, above) for below, above in pairwise(known)]
@@ -224,17 +225,34 @@ class Ladder:
             order = min(max(2 * fall / sum(finer), order), most)
         return steps[-1] / math.expm1(order * finer[-1])
 
-    def _by_the_next(self, evaluator: Evaluator) -> float:
-        """What is left from here, by the step to the next rung that is finer enough, and the order from there on."""
-        upper = self.levels[self._above]
-        step = evaluator.error(self.beside | self.level.changes, self.beside | upper.changes)
-        top = self._above + 1 == len(self.levels)
-        return step if top else step / (1 - (self.level.fineness / upper.fineness) ** self.orders[1])
+    def _foretold(self, evaluator: Evaluator) -> float | None:
+        """What is left from here, up to a mark, by how errors fall on the rungs that are priced by it: the next one, of
+        twice as much, need not be looked at. None where that is not how they fall where rungs converge.
+        """
+        top = self._above(self.position)
+        marks = [index for index in range(self.position, top) if self.levels[index].fineness in self.marks]
+        seen = [low for low in range(self.position) if marks and self._above(low) == marks[0]]
+        coarse = [low for low in seen if STEP * self.levels[low].fineness <= self.levels[seen[-1]].fineness]
+        if not coarse:
+            return None
+        places = coarse[-1], seen[-1], self.position
+        first, last = (self._by_the_next(evaluator, place) for place in places[:2])
+        finer = [math.log(self.levels[b].fineness / self.levels[a].fineness) for a, b in pairwise(places)]
+        order = math.log(first / last) / finer[0] if first > last > 0 else 0.0
+        least, most = self.orders
+        return None if order < least else last * math.exp(-min(order, most) * finer[1])
 
-    @property
-    def _above(self) -> int:
+    def _by_the_next(self, evaluator: Evaluator, position: int) -> float:
+        """What is left from a rung, by the step to the next that is finer enough, and the order from there on."""
+        level, upper = self.levels[position], self.levels[self._above(position)]
+        step = evaluator.error(self.beside | level.changes, self.beside | upper.changes)
+        top = upper is self.levels[-1]
+        return step if top else step / (1 - (level.fineness / upper.fineness) ** self.orders[1])
+
+    def _above(self, position: int) -> int:
         """The next rung by a `STEP`, or mark, or the top."""
-        finer = (index for index, level in enumerate(self.levels) if level.fineness >= STEP * self.level.fineness)
+        least = STEP * self.levels[position].fineness
+        finer = (index for index, level in enumerate(self.levels) if level.fineness >= least)
         marked = (index for index in finer if not self.marks or self.levels[index].fineness in self.marks)
         return next(marked, len(self.levels) - 1)
 
@@ -243,10 +261,10 @@ class Ladder:
         which may then do. Rungs that cannot do, at the fastest that errors fall, are not looked at.
         """
         key = self._key(self.position)
-        unseen = not self.marks and self._above + 1 < len(self.levels) and key not in self.compared
+        unseen = not self.marks and self._above(self.position) + 1 < len(self.levels) and key not in self.compared
         if self.successive and self.position > 0 and unseen:
             self.compared.add(key)
-            self.errors[key] = self._by_the_next(evaluator)
+            self.errors[key] = self._by_the_next(evaluator, self.position)
             return
         before = self.position
         self.position += 1

@@ -355,8 +355,7 @@ def test_what_is_left_of_a_ladder_stays_near_the_truth(order: float, total: int,
 )
 def test_a_rung_is_foretold_by_one_that_is_finer_enough(counts: list[int], above: list[int]) -> None:
     ladder = Ladder("wavelengths", [Level(str(n), {"bands": n}, n) for n in counts], {}, successive=True)
-    for ladder.position, expected in enumerate(above):
-        assert ladder._above == expected, ladder.level.label
+    assert [*map(ladder._above, range(len(counts)))] == above
 
 
 @pytest.mark.parametrize(
@@ -370,8 +369,12 @@ def test_a_rung_is_foretold_by_one_that_is_finer_enough(counts: list[int], above
 def test_few_rungs_are_marks_by_which_the_others_are_foretold(counts: list[int], above: list[int]) -> None:
     levels = [Level(str(n), {"layers": n}, n) for n in counts]
     ladder = Ladder("depth", levels, {}, successive=True, fastest=FASTEST, marks=MARKS)
-    for ladder.position, expected in enumerate(above):
-        assert ladder._above == expected, ladder.level.label
+    assert [*map(ladder._above, range(len(counts)))] == above
+
+
+def depths(counts: list[int]) -> Ladder:
+    levels = [Level(str(n), {"layers": n}, n) for n in counts]
+    return Ladder("depth", levels, {}, successive=True, fastest=FASTEST, marks=MARKS)
 
 
 @pytest.mark.parametrize("most", [0.3, 0.05, 0.01, 1e-4])
@@ -384,8 +387,7 @@ def test_layers_are_climbed_by_marks_alone(most: float) -> None:
         asked.append(theirs["layers"])
         return ours["layers"] ** -ORDERS[1] - theirs["layers"] ** -ORDERS[1]
 
-    levels = [Level(str(n), {"layers": n}, n) for n in counts]
-    ladder = Ladder("depth", levels, {}, successive=True, fastest=FASTEST, marks=MARKS)
+    ladder = depths(counts)
     evaluator = SimpleNamespace(error=error)
     ladder.price(evaluator, most)
     while ladder.error > most:
@@ -393,6 +395,36 @@ def test_layers_are_climbed_by_marks_alone(most: float) -> None:
     fits = next((n for n in counts[:-1] if n ** -ORDERS[1] <= most), counts[-1])
     assert ladder.level.fineness == fits
     assert {*asked} <= {*MARKS, counts[-1]}
+
+
+@pytest.mark.parametrize("n", [4, 5, 9, 13, 25, 33])
+@pytest.mark.parametrize("seed", range(6))
+def test_what_falls_as_it_should_is_foretold_up_to_a_mark(seed: int, n: int) -> None:
+    """Of errors that fall with a power of the number of layers, from some number on: what is said is no less than the
+    truth. Where they fall so from the first on no finer layers are looked at, and where they do not yet, others are.
+    """
+    draw = random.Random(seed)
+    onset, most = draw.choice([0.1, draw.uniform(0.3, 12)]), 1.0
+    order = draw.uniform(2, 2.5) if onset == 0.1 else draw.uniform(1.6, 2.5)
+    counts, asked = [1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97], []
+    mark = next(mark for mark in MARKS if mark >= n)
+
+    def left(n: float) -> float:
+        return 1 / (1 + (n / onset) ** order)
+
+    def error(ours: dict, theirs: dict, care: Care = Care.FULL) -> float:
+        asked.append(theirs["layers"])
+        return math.hypot(left(ours["layers"]), left(theirs["layers"]))  # what either misses is not alike
+
+    ladder = depths(counts)
+    ladder.position = counts.index(n)
+    ladder.price(SimpleNamespace(error=error), most)
+    assert ladder.error > left(n)
+    assert onset > 0.1 or {*asked} == {mark}
+    flat = depths(counts)
+    flat.position = counts.index(n)
+    flat.price(SimpleNamespace(error=lambda ours, theirs: asked.append(theirs["layers"]) or 0.1), most)
+    assert asked[-1] > mark
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -53,26 +55,35 @@ def zernike_sum(coefficients: Tensor, pupil: Pupil) -> Tensor:
     Z = sqrt(n + 1) [sqrt 2] rho^|m| R'(rho^2) cos or sin(m theta), with rho^|m| exp(i m theta) = (x + iy)^|m|: a
     polynomial, so value and gradient are finite on the axis.
     """
-    total = torch.zeros_like(pupil.rho2)
     rho2 = pupil.rho2
     x, y = torch.broadcast_tensors(pupil.x, pupil.y)
-    powers = {0: (torch.ones_like(rho2), torch.zeros_like(rho2))}
-    for index, coefficient in enumerate(float64(coefficients).unbind()):
-        n, m = noll_indices(index + 1)
-        order = abs(m)
-        for k in range(1, order + 1):
-            if k not in powers:
-                re, im = powers[k - 1]
-                powers[k] = (re * x - im * y, re * y + im * x)
-        radial = torch.zeros_like(rho2)
-        term = 1.0  # coefficients of R_n^m by their ratio, highest power first (Horner)
-        half = (n - order) // 2
-        for s in range(half + 1):
-            radial = radial * rho2 + term
-            term *= -((n - s - half) * (half - s)) / ((s + 1) * (n - s)) if n > s else 0.0
-        scale = _zernike_scale(n, m)
-        total = total + coefficient.to(rho2.device) * scale * radial * powers[order][1 if m < 0 else 0]
+    powers, total = (torch.ones_like(rho2), torch.zeros_like(rho2)), torch.zeros_like(rho2)
+    every = float64(coefficients).to(rho2.device).unbind()
+    indices = [noll_indices(index + 1) for index in range(len(every))]
+    for order in range(1 + max((abs(m) for _, m in indices), default=-1)):
+        if order:
+            re, im = powers
+            powers = re * x - im * y, re * y + im * x
+        for sign, power in zip((1, -1) if order else (1,), powers, strict=False):
+            own = [(n, c) for (n, m), c in zip(indices, every, strict=True) if m == sign * order]
+            if own:  # all polynomials of one angle are one polynomial
+                radial, *others = _radial(own, order)
+                for coefficient in others:
+                    radial = torch.addcmul(coefficient, radial, rho2)
+                total = torch.addcmul(total, radial, power)
     return total
+
+
+def _radial(own: Sequence[tuple[int, Tensor]], order: int) -> list[Tensor]:
+    """Coefficients of sum c sqrt(n + 1) [sqrt 2] R_n^m / rho^m, a polynomial in rho^2, the highest power first."""
+    half = (max(n for n, _ in own) - order) // 2
+    found = [torch.zeros_like(own[0][1]) for _ in range(half + 1)]
+    for n, coefficient in own:
+        steps, term = (n - order) // 2, _zernike_scale(n, order)
+        for s in range(steps + 1):  # by their ratio
+            found[half - steps + s] = found[half - steps + s] + coefficient * term
+            term *= -((n - s - steps) * (steps - s)) / ((s + 1) * (n - s)) if n > s else 0.0
+    return found
 
 
 def _zernike_scale(n: int, m: int) -> float:

@@ -106,7 +106,7 @@ class Renderer(Bank):
         tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
         spread = min(out, self.groups)  # of each mask
         if coverage and self.weights is not None and not self._few:
-            contracted += out * self.groups * kernel
+            contracted += out * self.groups * kernel / 8
         if self.direct:
             summed = products + (2 * spread if coverage else 0)
             slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
@@ -120,7 +120,7 @@ class Renderer(Bank):
         if coverage:
             ratio = math.prod(self._of_masks.sizes.size) / points
             transforms += ratio * (batch * tiles * 2 * (1 + spread) + spread)
-            touched += ratio * tiles * points * 2 * (1 + 3 * spread) + 6 * out * pixels
+            touched += ratio * tiles * points * spread + 6 * out * pixels
             touched += 2 * out * self.groups * pixels / 8 if self._few else 0.0
         memory = float(batch * itemsize * (held * points + (inputs + back) * pixels))
         operations = {"transform": transforms * points * math.log2(max(2, points))}

@@ -236,7 +236,7 @@ def _kernels_take(n: Bank) -> Takes:
     cost, once = (0.0, 0.0) if few else (n.planes, kernels)
     if n.spectra is None:
         cost = inf
-    contracted = kernels * n.groups * prod(n.window)
+    contracted = kernels * n.groups * prod(n.window) / 8
     held = n.planes + kernels + 3 + n.channels
     return Takes(n.planes, kernels, n.channels, kernels, cost=cost, once=once, held=held, contracted=contracted)
 
@@ -269,7 +269,8 @@ def _kernels(bank: Bank, psfs: Tensor) -> Blur:
 
 def _bands_take(n: Bank) -> Takes:
     at_once = min(n.bands, n.sizes.bands)
-    products = n.bands * (1 + n.channels + (0 if n.spectra is None else n.planes))
+    mixed = n.channels + (0 if n.spectra is None else n.planes)
+    products = n.bands + n.bands * mixed // 8  # strips that are mixed stay in the processor's cache
     cost = inf if n.direct else n.planes + products / 10
     held = (at_once if n.spectra is None else n.planes) + at_once + 2 * n.channels
     return Takes(n.planes, n.bands, n.channels, products, cost=cost, once=n.bands, held=held)
