@@ -93,17 +93,17 @@ def test_a_large_picture_is_cut_into_even_squares(seed: int, monkeypatch: pytest
 
 @pytest.mark.parametrize("way", [{}, *WAYS.values()], ids=["whole", *WAYS])
 @pytest.mark.parametrize("content", CONTENTS)
-@pytest.mark.parametrize("between", [False, True], ids=["one PSF", "between PSFs"])
-def test_bands_that_share_psfs(content: str, way: dict, between: bool) -> None:
+@pytest.mark.parametrize("between", [0, 3, 7], ids=["one PSF", "between few", "between as many"])
+def test_bands_that_share_psfs(content: str, way: dict, between: int) -> None:
     """The same as a bank in which each band has its own, whatever is contracted first."""
     factors, channels = CONTENTS[content]
     picture, window, bands = (21, 18), (6, 9), 7
     shares = torch.nn.functional.one_hot(torch.tensor([1, 0, 0, 1, 2, 2, 1])).double()
     if between:
-        shares = random(bands, 3, seed=5)
+        shares = random(bands, between, seed=5)
     spectra = None if factors is None else random(factors, bands, seed=3)
     weights = None if channels is None else random(channels, bands, seed=4)
-    planes, few = random(2, factors or bands, *picture, seed=1), random(1, 3, *window, seed=2)
+    planes, few = random(2, factors or bands, *picture, seed=1), random(1, between or 3, *window, seed=2)
     fixed = {"spectra": spectra, "weights": weights, "picture": picture}
     shared = Renderer(few, shares=shares, **fixed, **way)
     copied = Renderer(torch.einsum("lg,zghw->zlhw", shares, few), **fixed)
@@ -251,6 +251,14 @@ def test_fast_lengths_are_the_shortest(span: range) -> None:
         candidates = range(math.ceil(least / step) * step, 4 * least + 4, step)
         assert fast_length(least) == next(n for n in candidates if smooth(n))
     assert 10**15 < fast_length(10**15 + 1) < 1.001e15  # by products, not by trying
+
+
+def test_few_planes_and_psfs_before_many_channels_take_few_transforms() -> None:
+    """Each plane through each PSF, not each channel."""
+    shares = torch.nn.functional.one_hot(torch.arange(28) // 4).double()
+    bank = Renderer(random(1, 7, 9, 9), shares=shares, spectra=random(3, 28), weights=random(12, 28), picture=(40, 30))
+    apart, groups = choose(bank, 1).takes(bank), TABLE["groups"].takes(bank)
+    assert [way.inputs + way.kernels + way.outputs for way in (apart, groups)] == [3 + 7 + 21, 84 + 7 + 12]
 
 
 @pytest.mark.parametrize("batch", [1, 10])

@@ -32,8 +32,9 @@ class Renderer(Bank):
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
         bank, kernels = self._of_masks, self.psfs[layer]
-        if self.weights is not None and not self._few:
-            kernels = torch.einsum("cg,gyx->cyx", self.grouped(self.weights), kernels)
+        mixing = self.grouped(self.kappa())
+        if not (self._few or self.weights is self.shares is None):
+            kernels = torch.einsum("cg,gyx->cyx", mixing, kernels)
         sums = kernels.sum((-2, -1))
         if not self._few:
             kernels = kernels / sums[:, None, None]
@@ -44,7 +45,6 @@ class Renderer(Bank):
             spread = bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
         if not self._few:
             return spread
-        mixing = self.grouped(self.kappa())
         return torch.einsum("cg,bghw->bchw", mixing / (mixing @ sums)[:, None], spread)
 
     @property
