@@ -207,7 +207,7 @@ def _groups(bank: Bank, psfs: Tensor) -> Blur:
 def _apart_takes(n: Bank) -> Takes:
     parts = n.planes * n.groups
     touched = n.channels * parts * prod(n.picture) / 8
-    cost, held = n.planes + parts - n.channels, n.planes + n.groups + 3 * parts
+    cost, held = n.planes + parts - n.channels, n.planes + n.groups + 2 + parts
     return Takes(n.planes, n.groups, parts, parts, cost=cost, once=n.groups, held=held, touched=touched)
 
 
@@ -217,15 +217,16 @@ def _apart(bank: Bank, psfs: Tensor) -> Blur:
 
     def direct(planes: Tensor) -> Tensor:
         found = correlate(bank.extend(planes).flatten(0, 1)[:, None], psfs[:, None])
-        return found.unflatten(0, planes.shape[:2])
+        return torch.einsum("ckg,bkghw->bchw", mixing, found.unflatten(0, planes.shape[:2]))
 
     if bank.direct:
-        return lambda planes: torch.einsum("ckg,bkghw->bchw", mixing, direct(planes))
+        return direct
     convolution, transfers = bank.convolution, bank.transfers(lambda: psfs, bank.groups, psfs)
 
     def blur(planes: Tensor) -> Tensor:
-        parts = convolution.back(convolution.transform(planes)[:, :, None] * transfers)
-        return torch.einsum("ckg,bkghw->bchw", mixing, parts)
+        spectra = convolution.transform(planes).unbind(1)
+        parts = [convolution.back(spectrum * transfer) for spectrum in spectra for transfer in transfers]
+        return torch.einsum("cp,bphw->bchw", mixing.flatten(1), torch.stack(parts, dim=1))
 
     return blur
 
