@@ -308,6 +308,7 @@ def test_a_step_of_the_real_sizes_has_the_loss_of_the_unfused_float64_path():
     check_against_unfused(style_step.Bench(style_step.Sizes()))
 
 
+@pytest.mark.slow
 def test_a_finely_sampled_textbook_comes_to_the_loss_of_a_step(step):
     camera = copy.deepcopy(step.cameras[True])
     as_timed = loss_of(step, style_step.Textbook(camera, step.sizes, oversample=2))

@@ -252,6 +252,7 @@ def test_psf_bad_input(tmp_path: Path) -> None:
     assert "with commas" in fails("psf", "--out", tmp_path / "psf.png", "--distances", "1;2")
 
 
+@pytest.mark.slow
 def test_lens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file is read with what was asked to be in focus; the table says what the lens does."""
     asked = []
@@ -493,6 +494,7 @@ def test_durations() -> None:
     assert {seconds: plots.duration(seconds) for seconds in times} == times
 
 
+@pytest.mark.slow
 def test_demo_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the scenes one with depth and a flat one, which stand for the others."""
     scenes = dict(demo.SCENES)

@@ -31,6 +31,7 @@ print(as_it_is, faults())
 
 
 @pytest.mark.skipif(not GLIBC, reason="a setting of glibc")
+@pytest.mark.slow
 def test_blocks_are_taken_from_the_system_once() -> None:
     """128 MB eight times, a page fault for each page: with memory that is kept none is cleared anew."""
     done = subprocess.run([sys.executable, "-c", AGAIN], capture_output=True, text=True, check=True)

@@ -75,6 +75,7 @@ def test_it_writes_a_camera_and_a_report(trained: Path) -> None:
     assert files.describe(trained)["configuration"]["class"] == "Camera"
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) -> None:
     """SIGTERM after the first step; then --resume."""
     out = tmp_path / "strokes.safetensors"
@@ -265,6 +266,7 @@ def test_threads_are_put_back(tmp_path: Path, monkeypatch) -> None:
         run(tmp_path / "b.safetensors", threads=0)
 
 
+@pytest.mark.slow
 def test_train_shoot_and_paint_as_commands(tmp_path: Path, trained: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     style = CHOSEN["style"]  # a file: one of kcam's own is painted larger, and is in the last command

@@ -163,6 +163,7 @@ def test_depth_maps_that_can_be_none(value: float) -> None:
         KC.RandomCamera([small_camera()])(photographs(1), inverse_depth=inverse)
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_picture_and_a_camera_of_ones_own() -> None:
     focal_length = nn.Parameter(torch.tensor(4.3 * mm))
     own = small_camera(focal_length=focal_length)

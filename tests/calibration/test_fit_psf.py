@@ -122,6 +122,7 @@ def test_as_well_where_the_noise_is_estimated() -> None:
     assert 0.8 < np.sqrt((found_**2).mean()) < 1.2
 
 
+@pytest.mark.slow
 def test_one_focus_leaves_the_sign_of_the_even_terms_open() -> None:
     truth = {4: 30 * nm, 5: -20 * nm, 6: 15 * nm, 7: 25 * nm, 8: -15 * nm}
     given = lens(8)

@@ -384,6 +384,7 @@ def test_raw_files_of_cameras_are_frames_too(tmp_path: Path) -> None:
         read_frame(tmp_path / "broken.nef")
 
 
+@pytest.mark.slow
 def test_without_times_a_file_says_null_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     frames = draw(6, size=64, levels=12, bits=12, well=2.0)

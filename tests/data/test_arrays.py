@@ -244,6 +244,7 @@ def document(*arguments: object, status: int = 0) -> dict[str, Any]:
     return json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_arrays_are_converted_looked_at_and_cut(tmp_path: Path) -> None:
     folder = scenes(tmp_path / "in")
     (folder / "notes.txt").write_text("")

@@ -322,6 +322,7 @@ def _process(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
 
 
+@pytest.mark.slow
 def test_as_a_process_it_is_quiet_without_a_terminal(tmp_path: Path) -> None:
     written = writers.kaist(tmp_path)
     (tmp_path / "bad.npz").write_bytes(b"no")

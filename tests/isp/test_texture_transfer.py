@@ -74,6 +74,7 @@ def test_strokes_follow_the_picture(angle: float) -> None:
     assert between(direction(left[0]), 0.0) < between(direction(left[0]), angle) + 0.2 or angle < 0.5
 
 
+@pytest.mark.slow
 def test_light_and_dark_are_kept_and_more_of_them_by_more_weight() -> None:
     picture = Scene.builtin("astronaut", size=96).to_srgb()
     exemplar = painting("strokes", size=128)
@@ -87,6 +88,7 @@ def test_light_and_dark_are_kept_and_more_of_them_by_more_weight() -> None:
     assert kept[2] > 0.6
 
 
+@pytest.mark.slow
 def test_the_same_seed_is_the_same_picture_and_another_is_another() -> None:
     picture, exemplar = torch.rand(1, 3, 32, 32), painting("mosaic", size=64)
     stage = isp.TextureTransfer(exemplar)
@@ -146,7 +148,7 @@ def test_the_palette_is_that_of_the_exemplar_and_what_is_brighter_stays_so() -> 
     assert float(even.flatten(1).std(1).max()) < 0.15  # 1.1 / 0.1 of the variance at most
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
 def test_what_is_shown_has_paints_of_the_exemplar(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Inks that are mixed two by two, never all three: what a loss tints to make up for them goes back to them."""
     inks = torch.tensor([[0.9, 0.9, 0.8], [0.1, 0.1, 0.3], [0.8, 0.3, 0.2]]).roll(seed, 1)
@@ -284,6 +286,7 @@ def test_steps_bring_the_style_and_what_is_shown_nearer() -> None:
     assert float((some - zero).abs().mean()) < 0.1  # it is the same picture still
 
 
+@pytest.mark.slow
 def test_steps_are_for_what_the_features_can_see() -> None:
     """64 pixels each way, of the picture and of the exemplar."""
     for side, own in ((63, 80), (80, 63)):
@@ -294,6 +297,7 @@ def test_steps_are_for_what_the_features_can_see() -> None:
         assert torch.equal(one, other)
 
 
+@pytest.mark.slow
 def test_steps_in_inference_mode_and_with_slopes() -> None:
     picture, stage = (
         torch.rand(1, 3, 64, 70),
@@ -360,6 +364,7 @@ def test_pictures_of_any_size_and_even_ones(shape: tuple[int, int], value: float
     assert bool(painted.isfinite().all())
 
 
+@pytest.mark.slow
 def test_half_precision_and_large_exemplars() -> None:
     exemplar = torch.rand(3, 800, 900)
     assert isp.texture_transfer(torch.rand(1, 3, 16, 16).half(), exemplar=exemplar).dtype == torch.float16
@@ -405,6 +410,7 @@ def test_it_repaints_pictures_only() -> None:
         isp.TextureTransfer(torch.rand(3, 64, 64))(torch.rand(1, 1, 8, 8))
 
 
+@pytest.mark.slow
 def test_what_was_made_of_an_exemplar_is_kept_until_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
     real = exemplars.Exemplar.of.__func__

@@ -286,6 +286,7 @@ def test_the_axis_alone_is_a_picture_of_one_psf() -> None:
     assert float((optics.Imaging(lens, pixel_pitch=10 * um)(scene_of(light)) - expected).abs().max()) > 5e-3
 
 
+@pytest.mark.slow
 def test_a_camera_with_a_real_lens_comes_back_from_its_file(tmp_path: Path) -> None:
     imaging = optics.Imaging(small(), pixel_pitch=40 * um, centre=(0.1 * mm, 0.0), spacing=16, psf_shape=(9, 9))
     camera = Camera(imaging, sensor.ColourFilter.nikon())

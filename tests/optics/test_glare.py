@@ -185,6 +185,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("channels", [3, 7])
+@pytest.mark.slow
 def test_the_stage_s_own_numbers_train(channels: int) -> None:
     grid = torch.linspace(430, 690, 7, dtype=torch.float64) * nm
     context = Context(wavelengths=grid, colour_filter=sensor.ColourFilter.kodak(), pixel_pitch=100 * um)

@@ -66,6 +66,7 @@ def plan_of(shot: Camera, light: Scene, tolerance: float) -> Plan:
     return plan
 
 
+@pytest.mark.slow
 def test_a_centred_subject_needs_one_psf_and_a_star_field_many() -> None:
     shot = camera()
     assert rows(plan_of(shot, stars(within=0.1), 0.003))["field variation"] == "1 PSF"
@@ -127,6 +128,7 @@ def test_shortcuts_and_plans_are_saved(tmp_path) -> None:
     assert plan.changes["field_variation"] is False
 
 
+@pytest.mark.slow
 def test_light_elsewhere_is_out_of_range() -> None:
     """A plan for what stands in the middle says so where a scene has its light in the corners."""
     shot = camera(pitch=2 * um)

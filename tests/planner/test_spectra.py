@@ -554,6 +554,7 @@ def test_plans_hold_for_lights_on_a_ramp(seed: int) -> None:
             assert plan.measure(camera, scene) <= tolerance, plan.changes
 
 
+@pytest.mark.slow
 def test_distances_may_have_windows_of_their_own() -> None:
     """That of one distance does not hold the rungs of another's."""
     plate = optics.ZernikeDOE(0.6 * torch.eye(8, dtype=torch.float64)[5])
@@ -774,7 +775,7 @@ def test_windows_hold_the_light_of_wavelengths_far_out_of_focus(seed: int) -> No
             assert planner.plan(tolerance).measure(camera, scene, truth=truth) <= tolerance
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in range(2, 6))])
 def test_few_spectra_are_those_of_the_whole_batch(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of which an item that is tried is a part: the others leave little of them to a dim one of other colours."""
     draw, count, bands = Draw(seed), 8, 16

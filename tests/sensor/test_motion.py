@@ -191,6 +191,7 @@ class TestTranslation:
             Motion(translation=(0.1, 0.0), time=0.1)(torch.ones(1, 3, 4, 4))
 
 
+@pytest.mark.slow
 def test_gradients() -> None:
     draw = Draw(0)
     signal = draw.noise(1, 1, 5, 6).requires_grad_()

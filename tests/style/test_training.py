@@ -61,6 +61,7 @@ def same(trained, straight) -> bool:
 
 
 @pytest.mark.filterwarnings("ignore::kcam.style.StyleWarning")  # it may well look like a negative for a while
+@pytest.mark.slow
 def test_the_loss_falls_and_every_part_learns() -> None:
     camera = tiny.camera()
     before = {name: value.clone() for name, value in camera.state_dict().items()}
