@@ -75,7 +75,6 @@ def test_it_writes_a_camera_and_a_report(trained: Path) -> None:
     assert files.describe(trained)["configuration"]["class"] == "Camera"
 
 
-@pytest.mark.slow
 def test_stopped_and_resumed_it_is_the_same_file(tmp_path: Path, trained: Path) -> None:
     """SIGTERM after the first step; then --resume."""
     out = tmp_path / "strokes.safetensors"

@@ -14,7 +14,7 @@ from kcam.optics.numerics import fast_length
 from kcam.optics.rendering.borders import part
 from kcam.optics.rendering.convolution import correlate
 from kcam.optics.rendering.place import Place
-from kcam.optics.rendering.ways import Bank, choose
+from kcam.optics.rendering.ways import CONTRACTED, Bank, choose
 
 _NEAR = 2**20  # pixels beyond which a plane is no longer near the processor
 _CUT = ("reflect", "replicate", "zero")  # borders beyond which is only what lies near them
@@ -31,21 +31,19 @@ class Renderer(Bank):
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
-        bank, kernels = self._of_masks, self.psfs[layer]
-        mixing = self.grouped(self.kappa())
-        if not (self._few or self.weights is self.shares is None):
-            kernels = torch.einsum("cg,gyx->cyx", mixing, kernels)
-        sums = kernels.sum((-2, -1))
-        if not self._few:
-            kernels = kernels / sums[:, None, None]
+        bank, kernels, mixing = self._of_masks, self.psfs[layer], self.grouped(self.kappa())
+        if self._few:
+            mixing = mixing / (mixing @ kernels.sum((-2, -1)))[:, None]
+        else:
+            if not (self.weights is self.shares is None):  # else each channel has its own
+                kernels = torch.einsum("cg,gyx->cyx", mixing, kernels)
+            kernels = kernels / kernels.sum((-2, -1), keepdim=True)
         if self.direct:
             spread = correlate(bank.extend(share), kernels[:, None])
         else:
             convolution, transfers = bank.convolution, bank.convolution.transfer(kernels)
             spread = bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
-        if not self._few:
-            return spread
-        return torch.einsum("cg,bghw->bchw", mixing / (mixing @ sums)[:, None], spread)
+        return torch.einsum("cg,bghw->bchw", mixing, spread) if self._few else spread
 
     @property
     def _few(self) -> bool:
@@ -106,7 +104,7 @@ class Renderer(Bank):
         tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
         spread = min(out, self.groups)  # of each mask
         if coverage and self.weights is not None and not self._few:
-            contracted += out * self.groups * kernel / 8
+            contracted += out * self.groups * kernel / CONTRACTED
         if self.direct:
             summed = products + (2 * spread if coverage else 0)
             slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
@@ -121,7 +119,7 @@ class Renderer(Bank):
             ratio = math.prod(self._of_masks.sizes.size) / points
             transforms += ratio * (batch * tiles * 2 * (1 + spread) + spread)
             touched += ratio * tiles * points * spread + 6 * out * pixels
-            touched += 2 * out * self.groups * pixels / 8 if self._few else 0.0
+            touched += 2 * out * self.groups * pixels / CONTRACTED if self._few else 0.0
         memory = float(batch * itemsize * (held * points + (inputs + back) * pixels))
         operations = {"transform": transforms * points * math.log2(max(2, points))}
         operations["touch"] = batch * touched + contracted

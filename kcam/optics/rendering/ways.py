@@ -28,6 +28,7 @@ Blur = Callable[[Tensor], Tensor]  # planes (B, K, H, W) to channels (B, C, H, W
 
 _WHOLE = 5 * 2**20  # pixels of a picture that are transformed at once, with a window of any size: measured on a CPU
 _SIDE = 1024  # of the squares of a larger one, at most
+CONTRACTED = 8  # products of a contraction, a matrix product, that take the time of one that stands alone
 
 
 @dataclass(eq=False)
@@ -177,7 +178,7 @@ def _each(bank: Bank, psfs: Tensor) -> Blur:
 
 def _groups_take(n: Bank) -> Takes:
     parts = n.channels * n.groups
-    touched = parts * n.planes * prod(n.picture) / 8
+    touched = parts * n.planes * prod(n.picture) / CONTRACTED
     held = 3 * n.channels + n.groups
     return Takes(parts, n.groups, n.channels, parts, cost=parts, once=n.groups, held=held, touched=touched)
 
@@ -206,8 +207,8 @@ def _groups(bank: Bank, psfs: Tensor) -> Blur:
 
 def _apart_takes(n: Bank) -> Takes:
     parts = n.planes * n.groups
-    touched = n.channels * parts * prod(n.picture) / 8
-    cost, held = n.planes + parts - n.channels, n.planes + n.groups + 2 + parts
+    touched = n.channels * parts * prod(n.picture) / CONTRACTED
+    cost, held = n.planes + parts - n.channels + parts / 10, n.planes + n.groups + 2 + parts
     return Takes(n.planes, n.groups, parts, parts, cost=cost, once=n.groups, held=held, touched=touched)
 
 
@@ -237,7 +238,7 @@ def _kernels_take(n: Bank) -> Takes:
     cost, once = (0.0, 0.0) if few else (n.planes, kernels)
     if n.spectra is None:
         cost = inf
-    contracted = kernels * n.groups * prod(n.window) / 8
+    contracted = kernels * n.groups * prod(n.window) / CONTRACTED
     held = n.planes + kernels + 3 + n.channels
     return Takes(n.planes, kernels, n.channels, kernels, cost=cost, once=once, held=held, contracted=contracted)
 
@@ -271,7 +272,7 @@ def _kernels(bank: Bank, psfs: Tensor) -> Blur:
 def _bands_take(n: Bank) -> Takes:
     at_once = min(n.bands, n.sizes.bands)
     mixed = n.channels + (0 if n.spectra is None else n.planes)
-    products = n.bands + n.bands * mixed // 8  # strips that are mixed stay in the processor's cache
+    products = n.bands + n.bands * mixed // CONTRACTED  # strips that are mixed stay in the processor's cache
     cost = inf if n.direct else n.planes + products / 10
     held = (at_once if n.spectra is None else n.planes) + at_once + 2 * n.channels
     return Takes(n.planes, n.bands, n.channels, products, cost=cost, once=n.bands, held=held)
