@@ -215,7 +215,7 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     own, off = view.imaging.accuracy.kappa or KAPPA, KAPPAS_OF_PIXELS if lens.has_pixels else KAPPAS
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in off if kappa < own]
     ladder = Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.few(bands=GRIDS), doubtful=True)
-    if view.one and view.evaluator.certain:
+    if view.evaluator.certain:
         ladder.off_by, ladder.least = BY_ONE, COARSE
     if told and (view.one or lens.has_pixels):
         ladder.bounds = {i: view.evaluator.error_of(off[level.fineness]) for i, level in enumerate(levels)}

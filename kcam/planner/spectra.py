@@ -32,7 +32,7 @@ from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.cross_spectra import cross_spectra
 from kcam.planner.light import UNSEEN, blurred, compressed, few_lights, lights, recorded
-from kcam.planner.transfers import GROUPS, Transfers, Way
+from kcam.planner.transfers import BETWEEN, GROUPS, Transfers, Way
 from kcam.scene import Scene
 
 LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
@@ -290,11 +290,14 @@ class Spectra:
         else:
             way = Way.LINES
         # layers lie between others, and windows cut the same off all of them: 1.0 to 1.2 times the truth, measured
-        factor = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
+        corners = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
+        factor = torch.tensor(corners, dtype=torch.float64)
+        if corners > 1 and not _differ(changes, against, LINEAR - COLOURS):
+            factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
         if _differ(changes, against, {"interpolate_bands"}):
-            factor *= self.optics.between_psfs
+            factor = factor * BETWEEN
         if changes.get("propagator") == against.get("propagator") == "fresnel":
-            factor *= self.optics.by_paraxial
+            factor = factor * self.optics.by_paraxial
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
             # that with the larger window first

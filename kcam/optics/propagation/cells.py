@@ -105,10 +105,13 @@ class Cells:
             r2, area = centres[:, None] ** 2 + centres**2, sides[:, None] * sides
             return torch.stack([(self.power * (area / (1 + v**2 * r2))).sum() for v in vergences])
         nodes = math.ceil(math.log(1e-10) / (2 * math.log(max(ratio, 1e-12))))
-        times, weights = (torch.as_tensor(v).to(vergences) for v in np.polynomial.laguerre.laggauss(nodes))
+        times, weights = (torch.as_tensor(v).to(vergences) for v in _laguerre(nodes))
         profile = torch.exp(-times[:, None] * (vergences[:, None, None] * centres) ** 2) * sides
         rows = (profile.to(self.power) @ self.power).to(profile)
         return (rows * profile).sum(-1) @ weights
+
+
+_laguerre = functools.lru_cache(np.polynomial.laguerre.laggauss)
 
 
 def sizes(query: Query, found: Sequence[PixelMap]) -> Maps:
@@ -167,7 +170,7 @@ def looked_up(values: Tensor, edges: np.ndarray, *, size: int, half_width: float
     centres = (edges[1:] + edges[:-1]) / 2
     index = np.floor((centres / half_width + 1) / 2 * size).astype(np.int64).clip(0, size - 1)
     index = torch.as_tensor(index, device=values.device)
-    return values.index_select(0, index).index_select(1, index)
+    return values.index_select(1, index).index_select(0, index)  # whole rows last: they are copied at once
 
 
 @functools.lru_cache(maxsize=6)

@@ -13,6 +13,7 @@ from kcam.optics.rendering.borders import border_index, extend_along
 
 _UNFOLDED = 2**25  # bytes of a strip that is convolved directly
 _PIXELS_IN_CACHE = 2**16  # of planes that are transformed at once
+_POINTS_AT_ONCE = 2**18  # of spectra that are multiplied and transformed back at once: calls of small ones count
 _STRIP = 2**17  # values of a strip of columns of half spectra
 _LINE = 8  # complex numbers that lie in one line of a processor's cache
 _ALL = slice(None)
@@ -70,6 +71,10 @@ class Convolution:
         """So many bands of so many pictures, as many at once as there is room for."""
         step = max(1, self.bands // (batch + 1))
         return [slice(start, min(start + step, count)) for start in range(0, count, step)]
+
+    def at_once(self, batch: int) -> int:
+        """Spectra of each picture of a batch that are multiplied and transformed back at once."""
+        return max(1, _POINTS_AT_ONCE // (batch * self.size[0] * self.size[1]))
 
     def strips(self, like: Tensor, count: int) -> list[slice]:
         """Columns of so many half spectra: on a CPU as many at once as stay in its cache."""

@@ -12,9 +12,8 @@ from torch import Tensor
 from kcam.effects import Work
 from kcam.optics.numerics import fast_length
 from kcam.optics.rendering.borders import part
-from kcam.optics.rendering.convolution import correlate
 from kcam.optics.rendering.place import Place
-from kcam.optics.rendering.ways import CONTRACTED, Bank, choose
+from kcam.optics.rendering.ways import Bank, choose
 
 _NEAR = 2**20  # pixels beyond which a plane is no longer near the processor
 _CUT = ("reflect", "replicate", "zero")  # borders beyond which is only what lies near them
@@ -31,24 +30,9 @@ class Renderer(Bank):
 
     def coverage(self, share: Tensor, *, layer: int) -> Tensor:
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
-        bank, kernels, mixing = self._of_masks, self.psfs[layer], self.grouped(self.kappa())
-        if self._few:
-            mixing = mixing / (mixing @ kernels.sum((-2, -1)))[:, None]
-        else:
-            if not (self.weights is self.shares is None):  # else each channel has its own
-                kernels = torch.einsum("cg,gyx->cyx", mixing, kernels)
-            kernels = kernels / kernels.sum((-2, -1), keepdim=True)
-        if self.direct:
-            spread = correlate(bank.extend(share), kernels[:, None])
-        else:
-            convolution, transfers = bank.convolution, bank.convolution.transfer(kernels)
-            spread = bank.in_squares(share, lambda part: convolution.back(convolution.transform(part) * transfers))
-        return torch.einsum("cg,bghw->bchw", mixing, spread) if self._few else spread
-
-    @property
-    def _few(self) -> bool:
-        """Whether there are fewer PSFs than channels, so that masks are spread by these."""
-        return self.groups < self.channels
+        weights = self.kappa()
+        sums = self.grouped(weights) @ self.psfs[layer].sum((-2, -1))
+        return self._of_masks(weights / sums[:, None]).blur(share, layer=layer)
 
     def near(self, place: Place, *, batch: int) -> Renderer | None:
         """The renderer of what a layer reaches from its place, to which `around` brings what lies around; None where
@@ -61,7 +45,7 @@ class Renderer(Bank):
 
     def around(self, planes: Tensor, place: Place, *, masks: bool = False) -> Tensor:
         """Planes (..., H, W), or masks, in what a layer reaches from its place, with what lies around."""
-        border = self._of_masks.border if masks else self.border
+        border = self._border_of_masks if masks else self.border
         for dim, (start, stop), m in zip((-2, -1), place.box(self.window, self.picture), self.window, strict=True):
             planes = part(planes, start - m // 2, stop + (m - 1) // 2, border, dim=dim)
         return planes
@@ -92,37 +76,36 @@ class Renderer(Bank):
         of_channel = torch.eye(self.channels).repeat_interleave(self.planes, 1)
         return replace(self, spectra=of_plane.to(self.psfs), weights=of_channel.to(self.psfs), shares=None)
 
+    def _of_masks(self, weights: Tensor) -> Renderer:
+        """Of masks, which are pictures of one plane, as bright in all bands."""
+        even = torch.ones(1, self.bands).to(self.psfs)
+        return replace(self, spectra=even, weights=weights, border=self._border_of_masks, cache=None)
+
     @property
-    def _of_masks(self) -> Bank:
+    def _border_of_masks(self) -> str:
         """Where zeros lie beyond the picture it is dark there, not empty: what stands at the border goes on."""
-        return replace(self, border="replicate") if self.border == "zero" else self
+        return "replicate" if self.border == "zero" else self.border
 
     def work(self, *, batch: int, coverage: bool) -> Work:
         """What one layer of a batch takes, with its coverage or without; of tensors the shapes are enough."""
         inputs, kernels, back, products, *_, held, touched, contracted = choose(self, batch).takes(self)
         points, pixels, kernel = (math.prod(size) for size in (self.sizes.size, self.picture, self.window))
-        tiles, out, itemsize = math.prod(self.squares), self.channels, self.psfs.element_size()
-        spread = min(out, self.groups)  # of each mask
-        if coverage and self.weights is not None and not self._few:
-            contracted += out * self.groups * kernel / CONTRACTED
+        tiles, itemsize = math.prod(self.squares), self.psfs.element_size()
         if self.direct:
-            summed = products + (2 * spread if coverage else 0)
             slow = 4 if pixels > 2**17 else 1  # measured: unfolded, a larger picture is far from the processor
-            memory = float(itemsize * (2 * inputs * pixels + summed * kernel + back * pixels))
-            touched += float((inputs + 2 * out) * pixels)
-            operations = {"product": float(batch * summed * pixels * kernel * slow)}
-            return Work(operations | {"touch": batch * touched + contracted}, batch * memory)
-        transforms = float(batch * tiles * (inputs + back) + kernels)  # those of the PSFs once
-        touched += float(tiles * points * (inputs + back + products))
-        contracted += kernels * points
-        if coverage:
-            ratio = math.prod(self._of_masks.sizes.size) / points
-            transforms += ratio * (batch * tiles * 2 * (1 + spread) + spread)
-            touched += ratio * tiles * points * spread + 6 * out * pixels
-            touched += 2 * out * self.groups * pixels / CONTRACTED if self._few else 0.0
-        memory = float(batch * itemsize * (held * points + (inputs + back) * pixels))
-        operations = {"transform": transforms * points * math.log2(max(2, points))}
-        operations["touch"] = batch * touched + contracted
-        if pixels > _NEAR:  # whole it is touched again and again in far memory, in tiles once
-            operations["large"] = float(batch * pixels * (inputs + back) * (2 if tiles == 1 else 1))
-        return Work(operations, memory)
+            memory = float(batch * itemsize * ((2 * inputs + back) * pixels + products * kernel))
+            touched += float((inputs + 2 * self.channels) * pixels)
+            operations = {"product": float(batch * products * pixels * kernel * slow)}
+        else:
+            memory = float(batch * itemsize * (held * points + (inputs + back) * pixels))
+            touched += float(tiles * points * (inputs + back + products))
+            contracted += kernels * points
+            transforms = float(batch * tiles * (inputs + back) + kernels)  # those of the PSFs once
+            operations = {"transform": transforms * points * math.log2(max(2, points))}
+            if pixels > _NEAR:  # whole it is touched again and again in far memory, in tiles once
+                operations["large"] = float(batch * pixels * (inputs + back) * (2 if tiles == 1 else 1))
+        work = Work(operations | {"touch": batch * touched + contracted}, memory)
+        if not coverage:
+            return work
+        laid_over = Work({"touch": float(6 * batch * self.channels * pixels)})
+        return work + laid_over + self._of_masks(self.kappa()).work(batch=2 * batch, coverage=False)
