@@ -32,7 +32,7 @@ from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.cross_spectra import cross_spectra
 from kcam.planner.light import UNSEEN, blurred, compressed, few_lights, lights, recorded
-from kcam.planner.transfers import BETWEEN, GROUPS, Transfers, Way
+from kcam.planner.transfers import GROUPS, Transfers, Way
 from kcam.scene import Scene
 
 LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
@@ -295,7 +295,7 @@ class Spectra:
         if corners > 1 and not _differ(changes, against, LINEAR - COLOURS):
             factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
         if _differ(changes, against, {"interpolate_bands"}):
-            factor = factor * BETWEEN
+            factor = factor * self.optics.between_psfs
         if changes.get("propagator") == against.get("propagator") == "fresnel":
             factor = factor * self.optics.by_paraxial
         for index, (rows, _) in enumerate(self.groups):

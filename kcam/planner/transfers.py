@@ -34,8 +34,9 @@ _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the pi
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
 # would be told too little without; of round ones 0.84 at least, and few lights may fall into a corner
-BETWEEN = 1.25  # times the error of PSFs between others: what cubics leave is smaller than what slices tell of a PSF.
-# Without, 0.75 to 1.24 times the truth of 157 behind maps of pixels (2 %, median), 0.65 at least
+_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
+# slices tell of a PSF, and of a map of pixels, of which only some rows are looked at: 0.75 to 1.24 times the truth of
+# 157 without it (2 %, median), and 0.56 of one picture at 0.001
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -189,6 +190,11 @@ class Transfers:
         if query is None or query.has_pixel_phase or self.fits:
             return 1.0
         return _CUT_ROUND if query.symmetric else _CUT
+
+    @functools.cached_property
+    def between_psfs(self) -> float:
+        """Times the error of PSFs that lie between others."""
+        return _BETWEEN_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _BETWEEN
 
     @functools.cached_property
     def corners_of_colours(self) -> float:
