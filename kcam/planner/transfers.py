@@ -33,7 +33,7 @@ GROUPS = 7  # PSFs, up to whose number errors are told so: 0.9 to 1.15 times wha
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
-# would be told too little without; of round ones 0.84 at least, and few lights may fall into a corner
+# would be told too little without; few lights may fall into a corner
 _BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
 # slices tell of a PSF, and of a map of pixels, of which only some rows are looked at: 0.75 to 1.24 times the truth of
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
@@ -199,7 +199,7 @@ class Transfers:
     @functools.cached_property
     def corners_of_colours(self) -> float:
         """The same of choices of wavelengths alone, unless a few lights stand out."""
-        return _CUT_COLOURS if self.corners == _CUT else 1.0
+        return min(self.corners, _CUT_COLOURS)
 
     @functools.cached_property
     def by_paraxial(self) -> float:
