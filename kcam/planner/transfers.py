@@ -198,7 +198,7 @@ class Transfers:
 
     @functools.cached_property
     def corners_of_colours(self) -> float:
-        """The same of choices of wavelengths alone, unless a few lights stand out."""
+        """As `corners`, of choices of wavelengths alone, unless a few lights stand out."""
         return min(self.corners, _CUT_COLOURS)
 
     @functools.cached_property
