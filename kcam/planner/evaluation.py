@@ -140,7 +140,7 @@ class Evaluator:
         that stand out, and not more where pixels see little of its colour.
         """
         known = isinstance(imaging.lens, Lens)  # whose PSFs brighten nothing
-        if not known or any(bool(spectra.few_lights.any()) for spectra in told):
+        if not known or self.few_lights:
             return False
         self.signals = self._signals(sharp := {**settings, "blur": False})
         self.lost = self._cut_off()
@@ -200,6 +200,11 @@ class Evaluator:
     def certain(self) -> bool:
         """Whether what choices cost is known without trying all of them together."""
         return self.spectra is not None
+
+    @property
+    def few_lights(self) -> bool:
+        """Whether a few lights stand out in some item, where that is known."""
+        return any(bool(spectra.few_lights.any()) for spectra in self.spectra or ())
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether all wavelengths may be compared at no cost."""

@@ -53,17 +53,19 @@ class Ladder:
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
-    off_by: how many times too large or too small a rough estimate may be; 1 where there is none. from_top: whether
-    rungs are looked at from the top down, to the last that may do alone; where there is a rough estimate, that is asked
-    first, the others are priced at one wavelength, and it says what more of them add. fastest: with which power of its
-    step its error falls at most, so that rungs which cannot do are not looked at; None where any may do. marks:
-    fineness of the rungs by which others are priced, of successive ones: few, so that these are computed once.
+    off_by: how many times too large or too small a rough estimate may be; 1 where there is none. little: see `LITTLE`.
+    from_top: whether rungs are looked at from the top down, to the last that may do alone; where there is a rough
+    estimate, that is asked first, the others are priced at one wavelength, and it says what more of them add. fastest:
+    with which power of its step its error falls at most, so that rungs which cannot do are not looked at; None where
+    any may do. marks: fineness of the rungs by which others are priced, of successive ones: few, so that these are
+    computed once.
     seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`),
     by `most`, what was allowed when it was last priced.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     bounds: errors that rungs have at most, by their position: where so much is `SMALL`, it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
-    urgency: how much more its error counts than others' where the next ladder to climb is chosen.
+    tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; urgency:
+    how much more its error counts than others' where the next ladder to climb is chosen.
     """
 
     effect: str
@@ -75,6 +77,7 @@ class Ladder:
     follows: Ladder | None = None
     settled: float = math.inf
     off_by: float = 1.0
+    little: float = LITTLE
     orders: tuple[float, float] = ORDERS
     from_top: bool = False
     fastest: float | None = None
@@ -83,6 +86,7 @@ class Ladder:
     least: float = 0.0
     bounds: dict[int, float] = field(default_factory=dict)
     doubtful: bool = False
+    tried: bool = False
     urgency: float = 1.0
     most: float = math.inf
     position: int = 0
@@ -118,6 +122,11 @@ class Ladder:
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
+
+    @property
+    def nothing(self) -> bool:
+        """Whether its errors are 0 beside the rung that it follows: one layer hides nothing, one PSF has one colour."""
+        return self.follows is not None and self.follows.level.fineness == 1
 
     def bounded(self, most: float) -> int:
         """The lowest rung that may be taken unseen where there may be so much error, or the top."""
@@ -155,7 +164,7 @@ class Ladder:
         key = self._key(position)
         if position == len(self.levels) - 1 or key in self.errors:
             return
-        if self.follows and self.follows.level.fineness == 1:  # one layer hides nothing, one PSF has one colour
+        if self.nothing:
             self.errors[key] = 0.0
         elif position in self.bounds and self.bounds[position] <= SMALL * most:
             self.errors[key] = self.bounds[position]
@@ -199,7 +208,7 @@ class Ladder:
 
     def _settled(self, roughly: float, most: float) -> bool:
         """Whether a rough estimate says enough: that this may do in any case, or in none."""
-        return self.off_by * roughly <= LITTLE * most or roughly > self.off_by * most
+        return self.off_by * roughly <= self.little * most or roughly > self.off_by * most
 
     def _beyond(self, evaluator: Evaluator) -> float:
         """What is left from here to where rungs converge, by the steps up to here; at the foot, and where rungs are

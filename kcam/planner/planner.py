@@ -197,14 +197,13 @@ class Planner:
         counted = [skip for skip in skips if skip.counted]
         if self.evaluator.certain:
             ways: list[Any] = [*steps, *counted]
-            doubtful = [ladder for ladder in steps if ladder.doubtful and self.one]
             for ladder in steps:
-                if ladder.bounds or (ladder.doubtful and self.one):
+                if ladder.bounds or self._last(ladder):
                     ladder.position = ladder.bounded(allowed / UNTRIED)
             _climb(steps, counted, self.evaluator, allowed / UNTRIED)
-            for ladder in doubtful:
+            for ladder in filter(self._last, steps):
                 before, places = _changes(steps), [way.position for way in ways]
-                if ladder.position > 0 and self.prices.worth(ladder, before):
+                if ladder.position > 0 and (ladder.nothing or self.prices.worth(ladder, before)):
                     ladder.position = 0
                     _climb(steps, counted, self.evaluator, allowed / UNTRIED)
                     if self.prices.of(_changes(steps))[0] > self.prices.of(before)[0]:  # others climbed for it
@@ -225,6 +224,10 @@ class Planner:
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
             max(below, key=_urgency).climb(self.evaluator, allowed / SAFETY)
+
+    def _last(self, ladder: Ladder) -> bool:
+        """Whether it is looked at when the others stand, where it then saves enough."""
+        return ladder.tried or (ladder.doubtful and self.one)
 
     def _ways(self) -> tuple[list[Ladder], list[Skip]]:
         """All choices."""

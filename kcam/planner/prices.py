@@ -19,6 +19,7 @@ from kcam.scene import Scene
 from kcam.sensor import ColourFilter
 
 GAIN = 0.98  # of the time, that a choice must leave to be considered
+SAVED = 0.15  # of the time, that one must save which is looked at last, for a plan of many pictures
 
 
 class Prices:
@@ -30,7 +31,7 @@ class Prices:
     def __init__(
         self, camera: Camera, evaluator: Evaluator, scenes: Sequence[Scene], always: dict[str, Any], *, one: bool
     ) -> None:
-        self.evaluator, self.imaging, self.always = evaluator, evaluator.imaging, always
+        self.evaluator, self.imaging, self.always, self.one = evaluator, evaluator.imaging, always, one
         self.apart = evaluator.apart if evaluator.varies and evaluator.samples and not one else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
         self.channels = self._channels(camera, scenes[0])
@@ -94,7 +95,9 @@ class Prices:
         return self.of(ladder.levels[0].changes)[0] <= GAIN * self.of({})[0] or len(ladder.levels) == 1
 
     def worth(self, ladder: Ladder, changes: Mapping[str, Any]) -> bool:
-        """Whether its cheapest rung saves more beside such changes than pricing it takes."""
+        """Whether its cheapest rung saves enough beside such changes; for a single picture, more than pricing it takes."""
         foot, beside, now = ladder.levels[0].changes, ladder.beside, self.of(changes)[0]
         saved = now - self.of({**changes, **foot})[0]
+        if not self.one:
+            return saved > SAVED * now
         return saved > (1 - GAIN) * now and saved > self.of(beside)[0] + self.of({**beside, **foot})[0]

@@ -9,7 +9,6 @@ window is left out of each row: rays of a smooth pupil that land there; of a map
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +33,6 @@ _SAMPLED = 32  # rows of a map of pixels at least, fewer than twice as many
 _PASSED = 12  # half width of the low-pass along v, in samples at its Nyquist
 _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
-_SLOPE = 1e-4  # semi-apertures between which slopes are taken
 _TAPS = range(-1, 3)
 _SPHERES = 3  # between which others lie: they rise with the third power of the vergence
 _MORE = 1.3  # times the samples that are needed, up to which those of other distances do
@@ -241,27 +239,19 @@ class _Rows:
     """The rows along x, or the columns along y: what is the same from all distances."""
 
     def __init__(self, query: Query, rows: Tensor, nodes: Tensor, axis: int, pixels: _Maps | None) -> None:
-        def path(side: float = 0.0) -> _Path:
-            return _Path(query, _pupil(query, nodes[None, :], rows[:, None] + side, axis))
-
-        self.axis, self.smooth, self.middle = axis, pixels is None, path()
-        self.passed = torch.ones_like(self.middle.pupil.rho2) if pixels is None else pixels.power(rows, nodes, axis)
-        self.rim, self._path = _rim(query, rows, nodes), path
-
-    @functools.cached_property
-    def sides(self) -> tuple[_Path, _Path]:
-        """Somewhat farther across the rows, and somewhat less far."""
-        return self._path(_SLOPE), self._path(-_SLOPE)
+        self.axis, self.smooth, self.spacing = axis, pixels is None, float(rows[1] - rows[0])
+        self.path = _Path(query, _pupil(query, nodes[None, :], rows[:, None], axis))
+        self.passed = torch.ones_like(self.path.pupil.rho2) if pixels is None else pixels.power(rows, nodes, axis)
+        self.rim = _rim(query, rows, nodes)
 
     def at(self, query: Query) -> _Lit:
         """From some distances."""
         half, slopes = query.shape[self.axis] / 2, None
-        coefficients, maps = self.middle.at(query)
-        own = residual_amplitude(query, self.middle.pupil)
+        coefficients, maps = self.path.at(query)
+        own = residual_amplitude(query, self.path.pupil)
         energy = self.rim * own**2 * self.passed
         if self.smooth and float(query.displacement.max()) > (half - _SOFT) * query.pixel_pitch:
-            up, down = (side.at(query)[1] for side in self.sides)
-            slopes = ((up - down) / (2 * _SLOPE)).to(query.dtype)
+            slopes = torch.gradient(maps, spacing=self.spacing, dim=1, edge_order=2)[0].to(query.dtype)
         energy = energy.expand(-1, *self.passed.shape).sum((-2, -1))
         dtype, amplitude = query.dtype, self.rim * own
         return _Lit(query, half, maps.to(dtype), coefficients, amplitude.to(dtype), energy.to(dtype), slopes)
