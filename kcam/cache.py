@@ -20,10 +20,12 @@ Left to whoever does so: changing kcam's functions and constants themselves.
 
 from __future__ import annotations
 
+import contextlib
 import operator
 import types
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextvars import ContextVar
 from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
@@ -40,8 +42,33 @@ _DEFINED: dict[type, tuple[tuple[Any, ...], ...]] = {}  # by `_members`
 _INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
+T = TypeVar("T")
+_SEEN: ContextVar[dict[tuple[int, str], tuple[Any, Any]] | None] = ContextVar("seen", default=None)
+
+
 class Unknown(Exception):
     """Something is held whose value cannot be told."""
+
+
+@contextlib.contextmanager
+def unchanged() -> Iterator[None]:
+    """While no module changes: what is `seen` of each is then looked at once, not whenever it is asked."""
+    token = _SEEN.set(_SEEN.get() or {})
+    try:
+        yield
+    finally:
+        _SEEN.reset(token)
+
+
+def seen(thing: object, what: str, look: Callable[[], T]) -> T:
+    """What a look at a thing finds, which is kept while all is `unchanged`."""
+    known = _SEEN.get()
+    if known is None:
+        return look()
+    key = id(thing), what
+    if key not in known:
+        known[key] = thing, look()  # held, for another may get its id
+    return known[key][1]  # type: ignore[no-any-return]
 
 
 def differentiated(tensor: Tensor) -> bool:
@@ -58,6 +85,19 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
 
     Raises: `Unknown` where that cannot be told.
     """
+    if not isinstance(thing, nn.Module):
+        return _value_of(thing, tensors, within)
+
+    def look() -> tuple[Any, list[Tensor]]:
+        own: list[Tensor] = []
+        return _value_of(thing, own, within), own
+
+    value, own = seen(thing, "value", look)
+    tensors += own
+    return value
+
+
+def _value_of(thing: Any, tensors: list[Tensor], within: tuple[int, ...]) -> Any:
     kind = type(thing)
     if kind in _PLAIN:
         return kind, thing
@@ -175,9 +215,6 @@ def _settings_of(thing: Any, tensors: list[Tensor]) -> Any:
         return thing, [_settings_of(part, tensors) for part in (*own.values(), *thing.children())]
     tensors += found
     return value
-
-
-T = TypeVar("T")
 
 
 class ValueCache:

@@ -11,6 +11,7 @@ from typing import Any, Required, TypedDict, Unpack
 import torch
 from torch import Tensor
 
+from kcam.cache import seen
 from kcam.inputs import as_values
 from kcam.optics.accuracy import Recipe
 from kcam.optics.elements.stack import ElementStack
@@ -261,7 +262,7 @@ class Lens(ElementStack):
                 f"samples {samples} across the pupil is above the limit of {MAX_PUPIL_SAMPLES}. Leave samples out for "
                 "as many as this PSF needs, or use a smaller shape."
             )
-        self.check()
+        seen(self, "check", self.check)
         self._check_f_number()
         where = points.positions
         where = None if where is None else where.to(pixels.device, torch.float64)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from kcam.cache import unchanged
 from kcam.camera import Camera
 from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
@@ -108,6 +109,7 @@ class Planner:
     """
 
     @no_more_than_free()
+    @unchanged()
     def __init__(
         self, camera: Camera, scenes: Scene | Sequence[Scene], *, max_memory: float | None = None, one: bool = False
     ) -> None:
@@ -135,6 +137,7 @@ class Planner:
         return costs.seconds(self.prices.work({}), usual) > worth * (1 + scene.shape[0] / 8)
 
     @no_more_than_free()
+    @unchanged()
     def plan(self, tolerance: float | str) -> Plan:
         """The plan for a tolerance."""
         start = time.perf_counter()

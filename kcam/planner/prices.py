@@ -95,7 +95,7 @@ class Prices:
         return self.of(ladder.levels[0].changes)[0] <= GAIN * self.of({})[0] or len(ladder.levels) == 1
 
     def worth(self, ladder: Ladder, changes: Mapping[str, Any]) -> bool:
-        """Whether its cheapest rung saves enough beside such changes; for a single picture, more than pricing it takes."""
+        """Whether its cheapest rung saves enough beside such changes, for a single picture more than pricing takes."""
         foot, beside, now = ladder.levels[0].changes, ladder.beside, self.of(changes)[0]
         saved = now - self.of({**changes, **foot})[0]
         if not self.one:
