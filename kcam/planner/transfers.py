@@ -86,6 +86,7 @@ class Transfers:
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
         self._lines: dict[Any, Transfer] = {}  # the last, of other distances, by these and wavelengths
         self._tables: dict[Any, Table | None] = {} if imaging.known is None else dict(imaging.known.others)
+        self._unions: dict[Any, Tensor] = {}  # by wavelengths
         self._sliced: dict[Any, Tensor] = {}  # by table, or how PSFs are computed, window and wavelengths
 
     def stage(self, changes: Mapping[str, Any]) -> Imaging:
@@ -112,6 +113,13 @@ class Transfers:
         few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
         few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
         return torch.cat([self.stage(one).psf_wavelengths(own, deep=deep) for one in few]).unique()
+
+    def _every_and(self, wavelengths: Tensor) -> Tensor:
+        """These, and those of `_every`: mostly they are among them."""
+        key = tuple(wavelengths.tolist())
+        if key not in self._unions:
+            self._unions[key] = torch.cat([self._every, wavelengths]).unique()
+        return self._unions[key]
 
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
         """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths
@@ -240,7 +248,7 @@ class Transfers:
         if not self._tabled[propagator]:
             return None
         few = grey or len(vergences) > _FEW_LAYERS
-        sets = [torch.cat([self._every, wavelengths]).unique()]
+        sets = [self._every_and(wavelengths)]
         if set(wavelengths.tolist()) <= set(self.few.tolist()):
             sets.append(self.few)
         keys = [(propagator, window, tuple(vergences.tolist()), tuple(some.tolist())) for some in sets]
@@ -261,7 +269,7 @@ class Transfers:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
         if self._folded_across:
             return None
-        window, some = self.window(imaging, vergences), torch.cat([self._every, wavelengths]).unique()
+        window, some = self.window(imaging, vergences), self._every_and(wavelengths)
         lens, bands = (imaging.accuracy.propagator, window), tuple(some.tolist())
         key = "lines", *lens, bands, tuple(vergences.tolist())
         if key not in self._tables:
