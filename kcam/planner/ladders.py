@@ -221,7 +221,8 @@ def _sampling(view: _View) -> Iterator[Ladder]:
     ladder = Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.few(bands=GRIDS), doubtful=True)
     if view.evaluator.certain:
         ladder.off_by, ladder.least = BY_ONE, COARSE
-    if told and (view.one or lens.has_pixels):
+    if told:
+        ladder.tried = True
         ladder.bounds = {i: view.evaluator.error_of(off[level.fineness]) for i, level in enumerate(levels)}
     if lens.has_pixels:
         ladder.errors |= {(position, 0): bound for position, bound in ladder.bounds.items()}
