@@ -208,6 +208,12 @@ class Imaging(Stage):
             )
         return own
 
+    def knowing_enough(self) -> Imaging:
+        """The same stage with what it knows, for a picture: PSFs that it does not know are computed alone."""
+        own = self.changed()
+        own.known = None if self.known is None else replace(self.known, ends=self.known.ends[:0])
+        return own
+
     def _check_recipe(self, *, known: bool = False) -> None:
         """What asks for a method that does not exist, or for one where nothing is computed, is refused at once.
 

@@ -91,7 +91,7 @@ def shoot(
     plan = planner.plan(tolerance if planner.pays else 0)
     stages = list(camera)
     if plan.changes and planner.evaluator.index is not None and planner.evaluator.imaging is not None:
-        stages[planner.evaluator.index] = planner.evaluator.imaging
+        stages[planner.evaluator.index] = planner.evaluator.imaging.knowing_enough()
     short = shortened(Camera(*stages, context=camera.context), plan.changes, plan.shortcuts)
     return short(scene, generator=generator), dataclasses.replace(plan, tolerance=tolerance)
 
