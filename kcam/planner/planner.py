@@ -212,6 +212,7 @@ class Planner:
                     if self.prices.of(_changes(steps))[0] > self.prices.of(before)[0]:  # others climbed for it
                         for way, position in zip(ways, places, strict=True):
                             way.position = position
+                        _climb(steps, counted, self.evaluator, allowed / UNTRIED)  # finer rungs may tell more of these
             return None
         while True:
             _climb(steps, counted, self.evaluator, allowed / SAFETY)
