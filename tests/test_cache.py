@@ -30,7 +30,7 @@ from torch.autograd import forward_ad
 from torch.nn.utils import parametrize
 
 from kcam import Camera, Context, Scene, optics, sensor
-from kcam.cache import Settings, Unknown, ValueCache, value_of
+from kcam.cache import Settings, Unknown, ValueCache, seen, unchanged, value_of
 from kcam.optics import accuracy as accuracy_module
 from kcam.optics.propagation.table import choose
 from kcam.optics.propagation.textbook import textbook_row
@@ -762,6 +762,31 @@ def test_looking_at_a_class_changes_nothing() -> None:
             look(cls)
     assert any("__slotnames__" in vars(cls) for cls in classes)
     assert Settings(camera) == before
+
+
+def test_while_nothing_changes_a_module_is_looked_at_once() -> None:
+    """And again where it may have changed since."""
+    lens, looks = next(stage for stage in Camera.preset("phone") if isinstance(stage, optics.Imaging)).lens, []
+
+    def look() -> int:
+        looks.append(len(looks))
+        return len(looks)
+
+    assert [seen(lens, "looks", look), seen(lens, "looks", look)] == [1, 2]
+    tensors: list[Tensor] = []
+    with unchanged():
+        value = value_of(lens, tensors)
+        assert seen(lens, "looks", look) == 3
+        with unchanged():
+            assert value_of(lens, again := []) is value
+            assert [*map(id, again)] == [*map(id, tensors)]
+            assert seen(lens, "looks", look) == 3
+        assert seen(copy.deepcopy(lens), "looks", look) == 4
+    assert value_of(lens, []) == value
+    lens.another = 1
+    assert value_of(lens, []) != value
+    with unchanged():
+        assert value_of(lens, []) != value
 
 
 def test_other_defaults_of_torch_are_other_values() -> None:

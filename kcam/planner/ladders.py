@@ -218,11 +218,12 @@ def _sampling(view: _View) -> Iterator[Ladder]:
         return
     own, off = view.imaging.accuracy.kappa or KAPPA, KAPPAS_OF_PIXELS if lens.has_pixels else KAPPAS
     levels = [Level(f"kappa {kappa:g}", {"kappa": kappa}, kappa) for kappa in off if kappa < own]
-    ladder = Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.few(bands=GRIDS), doubtful=True)
+    ladder = Ladder("pupil samples", [*levels, Level(f"kappa {own:g}", {}, own)], view.few(bands=GRIDS))
+    ladder.doubtful = not lens.has_pixels
     if view.evaluator.certain:
         ladder.off_by, ladder.least = BY_ONE, COARSE
     if told:
-        ladder.tried = True
+        ladder.tried = ladder.doubtful
         ladder.bounds = {i: view.evaluator.error_of(off[level.fineness]) for i, level in enumerate(levels)}
     if lens.has_pixels:
         ladder.errors |= {(position, 0): bound for position, bound in ladder.bounds.items()}

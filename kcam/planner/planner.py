@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import statistics
 import time
@@ -199,20 +200,7 @@ class Planner:
         """
         counted = [skip for skip in skips if skip.counted]
         if self.evaluator.certain:
-            ways: list[Any] = [*steps, *counted]
-            for ladder in steps:
-                if ladder.bounds or self._last(ladder):
-                    ladder.position = ladder.bounded(allowed / UNTRIED)
-            _climb(steps, counted, self.evaluator, allowed / UNTRIED)
-            for ladder in filter(self._last, steps):
-                before, places = _changes(steps), [way.position for way in ways]
-                if ladder.position > 0 and (ladder.nothing or self.prices.worth(ladder, before)):
-                    ladder.position = 0
-                    _climb(steps, counted, self.evaluator, allowed / UNTRIED)
-                    if self.prices.of(_changes(steps))[0] > self.prices.of(before)[0]:  # others climbed for it
-                        for way, position in zip(ways, places, strict=True):
-                            way.position = position
-                        _climb(steps, counted, self.evaluator, allowed / UNTRIED)  # finer rungs may tell more of these
+            self._foretell(steps, counted, allowed / UNTRIED)
             return None
         while True:
             _climb(steps, counted, self.evaluator, allowed / SAFETY)
@@ -228,6 +216,25 @@ class Planner:
             if self._checked[key] <= allowed / SAFETY:
                 return self._checked[key]
             max(below, key=_urgency).climb(self.evaluator, allowed / SAFETY)
+
+    def _foretell(self, steps: list[Ladder], counted: list[Skip], most: float) -> None:
+        """Climb until the estimates fit, and then look at what is looked at last."""
+        ways: list[Any] = [*steps, *counted]
+        climb = functools.partial(_climb, steps, counted, self.evaluator, most)
+        for ladder in steps:
+            if ladder.bounds or self._last(ladder):
+                ladder.position = ladder.bounded(most)
+        climb()
+        for ladder in filter(self._last, steps):
+            before, places = _changes(steps), [way.position for way in ways]
+            if ladder.position == 0 or not (ladder.nothing or self.prices.worth(ladder, before)):
+                continue
+            ladder.position = 0
+            climb()
+            if self.prices.of(_changes(steps))[0] > self.prices.of(before)[0]:  # others climbed for it
+                for way, position in zip(ways, places, strict=True):
+                    way.position = position
+                climb()  # finer rungs may have told more of these
 
     def _last(self, ladder: Ladder) -> bool:
         """Whether it is looked at when the others stand, where it then saves enough."""

@@ -106,7 +106,7 @@ SWITCHES = ("distortion", "field_variation", "lateral_colour", "relative_illumin
 SETTINGS = {"spacing": 20, "bands": 2, "interpolate_bands": True, "psf_shape": (9, 9), "layers": 2, "kappa": None}
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in range(3, 8))])
 def test_plans_for_cameras_with_shortcuts_of_their_own(seed: int) -> None:
     """Whatever a camera leaves out by itself, a plan is made beside it, and holds."""
     draw = Draw(seed)

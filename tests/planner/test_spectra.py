@@ -524,6 +524,40 @@ def test_what_wavelengths_change_where_much_is_seen_through_little(seed: int) ->
             assert evaluator.error({"bands": count}, {}) > 0.7 * trial
 
 
+@pytest.mark.parametrize(("seed", "tried"), [(174, False), (118, True)])
+def test_what_takes_psfs_to_price_is_looked_at_where_it_saves_enough(
+    seed: int, tried: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 174 masks of layers are a twentieth of a picture, of 118 a third: PSFs of a plain lens are cheap."""
+    asked, hiding = [], Spectra.hiding
+    monkeypatch.setattr(Spectra, "hiding", lambda *arguments: asked.append(0) or hiding(*arguments))
+    monkeypatch.setattr(costs, "current_rates", lambda *_: costs.RATES)
+    shot, light, _, _ = random_pair(seed)
+    with torch.no_grad():
+        plan = shot.plan(light, tolerance=0.01)
+    row = next(row for row in plan.decisions if row.effect == "occlusion")
+    assert bool(asked) == tried
+    assert row.chosen == "over"
+    assert row.why.startswith("none would cost" if tried else "would save less time than it takes to find out")
+
+
+def test_a_picture_computes_the_psfs_that_it_needs() -> None:
+    """Trials of few wavelengths of a round lens are computed beside those at its ends, which are then known."""
+    lens = optics.Lens(optics.CircularAperture(3 * mm), optics.ThinLens(25 * mm), focus_distance=1.0)
+    wavelengths, pixels = wavelength_grid(count=9), PixelGrid(4 * um, (17, 17))
+    imaging = optics.Imaging(lens, pixel_pitch=4 * um).knowing(wavelengths)
+    asked = Points(torch.tensor([0.5], dtype=torch.float64)), wavelengths[3:5], pixels
+    with torch.no_grad():
+        found = imaging.knowing_enough().bank(*asked)
+        assert len(imaging.known.psfs) == 2
+        assert torch.equal(imaging.bank(*asked), found)
+        assert len(imaging.known.psfs) == 2
+        other = imaging.bank(asked[0], wavelengths[5:6], pixels)
+        assert len(imaging.known.psfs) == 5
+        alone = optics.Imaging(lens, pixel_pitch=4 * um).bank(asked[0], wavelengths[5:6], pixels)
+    assert relative_rms(other, alone) < 1e-6
+
+
 @pytest.mark.parametrize(("pair", "seed"), [(random_pair, 236), (hard_pair, 69)])
 def test_plans_hold_where_they_did_not(pair: Callable[[int], tuple[Camera, Scene, str, int]], seed: int) -> None:
     """Pairs of the benchmark: lights on a ramp, by layers; and colours behind what is blurred wide, by wavelengths."""

@@ -246,12 +246,15 @@ class TestInACamera:
     @pytest.mark.parametrize(
         "motion",
         [
-            Motion((300.0, 100.0), time=0.01, readout=0.01),
-            Motion(path=sensor.tremor(0.02, amplitude=30.0, seed=3), time=0.01, readout=0.01),
-            Motion(flow=torch.full((2, 24, 32), 400.0), time=0.01),
-            Motion(translation=(0.01, 0.0), time=0.01),
+            pytest.param(Motion((300.0, 100.0), time=0.01, readout=0.01), id="velocity"),
+            pytest.param(
+                Motion(path=sensor.tremor(0.02, amplitude=30.0, seed=3), time=0.01, readout=0.01),
+                id="path",
+                marks=pytest.mark.slow,
+            ),
+            pytest.param(Motion(flow=torch.full((2, 24, 32), 400.0), time=0.01), id="flow"),
+            pytest.param(Motion(translation=(0.01, 0.0), time=0.01), id="translation", marks=pytest.mark.slow),
         ],
-        ids=["velocity", "path", "flow", "translation"],
     )
     def test_plans_keep_their_word_and_files_their_motion(self, motion: Motion, tmp_path: Path) -> None:
         camera, scene = self.camera(motion), Scene.builtin("motorcycle", (24, 32))

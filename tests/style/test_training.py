@@ -86,7 +86,7 @@ def test_only_parts_with_a_rate_train() -> None:
     assert changed == {"stages.1.coefficients"}
 
 
-@pytest.mark.parametrize("stop_after", [1, 3, 5])
+@pytest.mark.parametrize("stop_after", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 5))])
 def test_resumed_equals_uninterrupted(tmp_path: Path, straight, stop_after: int) -> None:
     first = train(tmp_path, stop_after=stop_after)
     assert not first.finished

@@ -157,10 +157,10 @@ def radial_transfer(query: Query) -> RadialTransfer:
     weights = t * step
     weights[: len(_NEAR_0)] += step**2 * torch.tensor(_NEAR_0, dtype=torch.float64, device=query.device)
     light = intensity * weights
-    count = max(_FEWEST, math.ceil(_PER_FRINGE * 2 * float(t[-1]) / math.pi))
+    count = max(_FEWEST, _EVEN * math.ceil(max(len(t), _PER_FRINGE * 2 * float(t[-1]) / math.pi) / _EVEN))
     return RadialTransfer(
         light=light / (2 * math.pi * energy[:, None]),
-        kernel=hankel_kernel(t, count, step=2 / (count - 1)),
+        kernel=_even_kernel(count, step=step * 2 / (count - 1), device=query.device)[: len(t)],
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
         rim=rim / pitch,
@@ -199,6 +199,21 @@ def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
     if rho.numel() * count > KEPT:
         return build(steps)
     return _KERNELS.get((rho, count, step), lambda: build(count))[:, :steps]
+
+
+def _even_kernel(count: int, *, step: float, device: torch.device) -> Tensor:
+    """J0(i j step), (count, count), of which half is computed: `hankel_kernel` of even radii."""
+
+    def build() -> Tensor:
+        table = torch.empty(count, count, dtype=torch.float64, device=device)
+        numbers = torch.arange(count, dtype=torch.float64, device=device)
+        for first in range(0, count, _EVEN):
+            rows = slice(first, first + _EVEN)
+            table[rows, first:] = BesselJ0.apply(numbers[rows, None] * numbers[first:] * step)
+            table[first:, rows] = table[rows, first:].T
+        return table
+
+    return build() if count**2 > KEPT else _KERNELS.get((count, step, device), build)
 
 
 def hankel(field: Tensor, steps: int, rho: Tensor, *, finer: int) -> Tensor:
