@@ -204,7 +204,7 @@ class Planner:
             return None
         while True:
             _climb(steps, counted, self.evaluator, allowed / SAFETY)
-            ways = [*_relevant(steps), *counted]
+            ways: list[Any] = [*_relevant(steps), *counted]
             below = [way for way in ways if not way.at_top]
             if not below:
                 return 0.0
