@@ -42,7 +42,7 @@ FEW_DISTANCES = 33
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
 
-BY_LINES, BY_ONE, BY_ONE_MODEL = 4.0, 4.0, 1.5
+BY_LINES, BY_ONE, BY_ONE_MODEL = 4.0, 4.0, 1.25
 """How many times too large or too small rough errors may be: of the PSF's window by line spreads instead of PSFs, which
 only refuse, of pupil samples at one wavelength instead of a few, and of the paraxial model, of which that is enough. Of
 the largest windows of 61 random pairs they were 0.52 to 3.1 times the others, of 150, where they were above `COARSE`,
