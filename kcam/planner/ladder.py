@@ -62,7 +62,7 @@ class Ladder:
     seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`),
     by `most`, what was allowed when it was last priced.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
-    bounds: errors that rungs have at most, by their position: where so much is `SMALL`, it needs no pricing.
+    bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; urgency:
     how much more its error counts than others' where the next ladder to climb is chosen.
@@ -85,6 +85,7 @@ class Ladder:
     seams: Callable[[Level], float] | None = None
     least: float = 0.0
     bounds: dict[int, float] = field(default_factory=dict)
+    small: float = SMALL
     doubtful: bool = False
     tried: bool = False
     urgency: float = 1.0
@@ -131,7 +132,7 @@ class Ladder:
     def bounded(self, most: float) -> int:
         """The lowest rung that may be taken unseen where there may be so much error, or the top."""
         top = len(self.levels) - 1
-        return min((place for place, bound in self.bounds.items() if bound <= SMALL * most), default=top)
+        return min((place for place, bound in self.bounds.items() if bound <= self.small * most), default=top)
 
     @property
     def _followed(self) -> int:
@@ -166,7 +167,7 @@ class Ladder:
             return
         if self.nothing:
             self.errors[key] = 0.0
-        elif position in self.bounds and self.bounds[position] <= SMALL * most:
+        elif position in self.bounds and self.bounds[position] <= self.small * most:
             self.errors[key] = self.bounds[position]
         elif self.successive:
             self.errors[key] = self._beyond(evaluator)
