@@ -674,20 +674,16 @@ class TestGuests:
 
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # torch's own, of its own tracing
 class TestCompile:
+    @pytest.mark.slow  # 1 to 6 s each; noise and some rows of vignetting: below
     @pytest.mark.parametrize(
         "name",
         [
-            *(
-                pytest.param(name, marks=pytest.mark.slow)  # 1 to 6 s each; some rows of vignetting: below
-                for name in (
-                    "vignetting",
-                    "exposure",
-                    "tone_curve",
-                    "white_balance",
-                    "lens_distortion",
-                    "chromatic_aberration",
-                )
-            ),
+            "vignetting",
+            "exposure",
+            "tone_curve",
+            "white_balance",
+            "lens_distortion",
+            "chromatic_aberration",
             "defocus",
         ],
     )

@@ -210,7 +210,7 @@ def test_adversarial_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> 
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, *range(200, 224)))]
+    "seed", [0, 2, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, *range(200, 224)))]
 )
 def test_assorted_pairs_stay_inside_the_tolerance(seed: int) -> None:
     """Apertures, elements, options and light as they are seldom put together."""
