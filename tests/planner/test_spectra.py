@@ -186,7 +186,7 @@ def test_what_coarse_pupils_and_the_paraxial_model_cost_is_bounded(pair: Callabl
     it leaves out of the phase.
     """
     told = 0
-    for seed in range(first, first + (30 if first < 80 else 8)):
+    for seed in range(first, first + (30 if first < 80 else 10)):
         camera, scene, *_ = pair(seed)
         planner = Planner(camera, scene)
         if planner.prices.of({})[0] > 1:

@@ -33,7 +33,7 @@ KEPT = 2**22
 """Entries of a table of J0 that is kept: 34 MB."""
 _KERNELS = ValueCache(8)  # the last tables
 _EVEN = 128  # steps by which tables grow, so that a lens that is focused anew finds its own
-_FEWEST, _PER_FRINGE = 256, 2  # frequencies in a table of transfer functions, in all and for each fringe
+_FEWEST = 256  # frequencies in a table of transfer functions
 _BEYOND_RAYS = 80.0  # times what the rim diffracts beyond all, for transfer functions
 _TAIL = 64  # rings of what it diffracts farther
 _CUBIC, _EIGHT = range(-1, 3), range(-3, 5)  # points on both sides of a value between them
@@ -157,7 +157,7 @@ def radial_transfer(query: Query) -> RadialTransfer:
     weights = t * step
     weights[: len(_NEAR_0)] += step**2 * torch.tensor(_NEAR_0, dtype=torch.float64, device=query.device)
     light = intensity * weights
-    count = max(_FEWEST, _EVEN * math.ceil(max(len(t), _PER_FRINGE * 2 * float(t[-1]) / math.pi) / _EVEN))
+    count = max(_FEWEST, _EVEN * math.ceil(len(t) / _EVEN))  # as many as there are t: two for each fringe
     return RadialTransfer(
         light=light / (2 * math.pi * energy[:, None]),
         kernel=_even_kernel(count, step=step * 2 / (count - 1), device=query.device)[: len(t)],
