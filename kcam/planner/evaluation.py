@@ -206,6 +206,11 @@ class Evaluator:
         """Whether a few lights stand out in some item, where that is known."""
         return any(bool(spectra.few_lights.any()) for spectra in self.spectra or ())
 
+    @property
+    def left_out(self) -> float:
+        """RMS of what the paraxial model leaves out of the phase of any scene [rad]."""
+        return max((spectra.optics.left_out for spectra in self.spectra or ()), default=0.0)
+
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether all wavelengths may be compared at no cost."""
         return self.spectra is not None and all(spectra.tabled(settings) for spectra in self.spectra)

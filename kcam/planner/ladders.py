@@ -15,7 +15,6 @@ import torch
 
 from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
-from kcam.optics.propagation.estimates import beyond_paraxial
 from kcam.optics.propagation.grid import sample_counts
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.rendering.depth import few_values
@@ -214,7 +213,7 @@ def _model(view: _View) -> Iterator[Ladder]:
         ladder.off_by, ladder.little = BY_ONE_MODEL, math.inf
         if view.query is not None and not view.evaluator.few_lights:
             tau = float(view.query.tau.detach())
-            ladder.bounds, ladder.small = {0: BEYOND * (tau + beyond_paraxial(view.query) / 10)}, SMALL_BEYOND
+            ladder.bounds, ladder.small = {0: BEYOND * (tau + view.evaluator.left_out / 10)}, SMALL_BEYOND
     yield ladder
 
 

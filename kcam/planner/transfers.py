@@ -210,10 +210,14 @@ class Transfers:
         return min(self.corners, _CUT_COLOURS)
 
     @functools.cached_property
+    def left_out(self) -> float:
+        """RMS of what the paraxial model leaves out of the phase [rad]."""
+        return 0.0 if self._widest is None else beyond_paraxial(self._widest)
+
+    @property
     def by_paraxial(self) -> float:
         """Times the error that the paraxial model tells of these optics."""
-        query = self._widest
-        return 1.0 if query is None or beyond_paraxial(query) < _ALIKE else _UNLIKE
+        return 1.0 if self.left_out < _ALIKE else _UNLIKE
 
     @functools.cached_property
     def _widest(self) -> Query | None:
