@@ -28,6 +28,8 @@ from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
 
 _BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
+_ASKED = 4  # PSFs, up to how many a choice of wavelengths is mostly asked about: their line spreads are known as well,
+_NEAR = 0.35  # and stand for those of the others where they are so near, in steps
 GROUPS = 7  # PSFs, up to whose number errors are told so: 0.9 to 1.15 times what they are by each band's own line
 # spread (5 to 95 % of 36 deep scenes behind maps), and 0.9 to 1.3 of PSFs between others, of which 6 are told worst
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
@@ -106,13 +108,20 @@ class Transfers:
         """Wavelengths that tell of others."""
         return self.stage({"bands": FEW_BANDS}).psf_wavelengths(self.wavelengths)
 
+    def _standing(self, most: int) -> Tensor:
+        """Wavelengths whose PSFs may stand for those of others: of a few that tell of others, and of so many at most."""
+        own, deep = self.wavelengths, self.deep
+        few: list[dict[str, Any]] = [{"bands": 1}, {"bands": FEW_BANDS}]
+        few += [{"bands": n} for n in group_counts(len(own)) if n <= most] if deep else []
+        few += [] if deep else [interpolated(n) for n in node_counts(len(own)) if n <= most]
+        return torch.cat([self.stage(one).psf_wavelengths(own, deep=deep) for one in few]).unique()
+
     @functools.cached_property
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
-        own, deep = self.wavelengths, self.deep
-        few: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, {}]
-        few += [{"bands": n} for n in group_counts(len(own))] if deep else map(interpolated, node_counts(len(own)))
-        return torch.cat([self.stage(one).psf_wavelengths(own, deep=deep) for one in few]).unique()
+        own, stages = self.wavelengths, (self.stage({"bands": None}), self.imaging)
+        bands = [stage.psf_wavelengths(own, deep=self.deep) for stage in stages]
+        return torch.cat([self._standing(len(own)), *bands]).unique()
 
     def _every_and(self, wavelengths: Tensor) -> Tensor:
         """These, and those of `_every`: mostly they are among them."""
@@ -129,7 +138,7 @@ class Transfers:
         shares = imaging.shares(wavelengths, deep=self.deep)
         many = way is Way.BETWEEN_LINES and shares is None and len(groups) > _BETWEEN_LINES
         if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
-            groups = _ends_and_between(wavelengths, _BETWEEN_LINES)
+            groups = _ends_and_between(wavelengths, _BETWEEN_LINES, self._standing(_ASKED))
             shares = _cubics(groups, wavelengths)
         return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
 
@@ -294,13 +303,16 @@ def _spectrum(light: Tensor, frequencies: Tensor) -> Tensor:
     return light.cpu().to(torch.complex128) @ torch.exp(-2j * math.pi * x[:, None] * frequencies)
 
 
-def _ends_and_between(wavelengths: Tensor, count: int) -> Tensor:
-    """The outermost of the wavelengths (L,), and so many less two of those between that 1/wavelength goes in even
-    steps, nearly.
+def _ends_and_between(wavelengths: Tensor, count: int, known: Tensor) -> Tensor:
+    """The outermost of the wavelengths (L,), and so many less two of those between, or of the known ones that are
+    `_NEAR` enough, that 1/wavelength goes in even steps, nearly.
     """
     numbers = 1 / wavelengths
     even = torch.linspace(float(numbers.min()), float(numbers.max()), count).to(numbers)
-    return wavelengths[(numbers - even[:, None]).abs().argmin(1).unique()]
+    found = wavelengths[(numbers - even[:, None]).abs().argmin(1)]
+    off, nearest = (1 / known - even[1:-1, None]).abs().min(1)
+    found[1:-1] = torch.where(off < _NEAR * (even[1] - even[0]), known[nearest], found[1:-1])
+    return found.unique()
 
 
 def _cubics(nodes: Tensor, wavelengths: Tensor) -> Tensor:
