@@ -62,7 +62,8 @@ class Decision:
 
     error: estimated, relative RMS of the noiseless raw; of noise and rounding their own sigma, relative likewise.
     counted: whether the error is part of the plan's sum; noise and rounding are judged by themselves.
-    seconds, memory: predicted for the raw, with this and all choices above [s, bytes].
+    seconds, memory: predicted for the raw, with this and all choices above [s, bytes]; in a plan for a single picture
+        with all choices of optics.
 
     Example:
     >>> camera, scene = Camera.phone(), Scene.builtin("coffee", size=32)

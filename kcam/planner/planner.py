@@ -7,7 +7,7 @@ import functools
 import math
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -143,10 +143,11 @@ class Planner:
         """The plan for a tolerance."""
         start = time.perf_counter()
         check_tolerance(tolerance)
-        rows = _Rows(self.prices)
+        ladders: list[Ladder] = []
+        skips: list[Skip] = []
         shortcuts: dict[int, dict[str, Any] | None] = {}
-        allowed, checked = 0.0, None
-        if tolerance != 0 and self.evaluator.samples:
+        allowed, checked, planned = 0.0, None, tolerance != 0 and bool(self.evaluator.samples)
+        if planned:
             ladders, skips = self._ways()
             noise = self.evaluator.noise()
             allowed = noise if isinstance(tolerance, str) else float(tolerance)
@@ -157,6 +158,8 @@ class Planner:
                 choice.position = 0
             checked = self._settle(ladders, skips, allowed, noise if isinstance(tolerance, str) else None)
             shortcuts = shortcuts_of(skips, allowed, noise if isinstance(tolerance, str) else None)
+        rows = _Rows(self.prices, _changes(ladders) if self.one else {})
+        if planned:
             for ladder in _relevant(ladders):
                 rows.add_ladder(ladder)
             rows.add_way()
@@ -362,12 +365,12 @@ def _urgency(way: Ladder | Skip) -> float:
 
 
 class _Rows:
-    """The decisions, one after the other, and what is spent after each."""
+    """The decisions, one after the other, and what is spent after each, beside changes that are priced at once."""
 
-    def __init__(self, price: Prices) -> None:
+    def __init__(self, price: Prices, changes: Mapping[str, Any]) -> None:
         self.price = price
         self.decisions: list[Decision] = []
-        self.changes: dict[str, Any] = dict(price.always)
+        self.changes: dict[str, Any] = price.always | dict(changes)
         self.spent, self.beside = price.of(self.changes), sum(price.stages.values())
 
     def _add(self, effect: str, chosen: str, instead: str, why: str, error: float = 0.0, counted: bool = True) -> None:

@@ -109,7 +109,7 @@ class Transfers:
         return self.stage({"bands": FEW_BANDS}).psf_wavelengths(self.wavelengths)
 
     def _standing(self, most: int) -> Tensor:
-        """Wavelengths whose PSFs may stand for those of others: of a few that tell of others, and of so many at most."""
+        """Wavelengths whose PSFs may stand for others: those of a few that tell of others, and of so many at most."""
         own, deep = self.wavelengths, self.deep
         few: list[dict[str, Any]] = [{"bands": 1}, {"bands": FEW_BANDS}]
         few += [{"bands": n} for n in group_counts(len(own)) if n <= most] if deep else []

@@ -321,6 +321,28 @@ def test_windows_hold_the_light_that_transfer_functions_begin_with(seed: int, sh
     torch.testing.assert_close(found, RADIAL(query).sum((-2, -1)), rtol=0, atol=2e-4)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_rims_diffract_light_around_where_their_rays_fall(seed: int) -> None:
+    """What falls just outside a window wider than the blur, of a round lens or an annulus out of focus: of light around
+    the axis a quarter of it would be told.
+    """
+    draw = Draw(seed)
+    side = draw.whole(65, 201) // 2 * 2 + 1
+    whole = side * 5 // 8 * 2 + 1
+    pitch, semi = draw.number(3, 6) * um, draw.number(6, 13) * mm
+    blurred = draw.number(0.3, 0.4) * side * pitch  # where the rays at the rim fall
+    aperture = optics.AnnularAperture(2 * semi, obscuration=draw.one_of(0.0, draw.number(0.1, 0.5)))
+    lens = optics.Lens(aperture, optics.ThinLens(50 * mm), focus_distance=0.25)
+    far = 4 - blurred / (semi * float(lens.sensor_distance))
+    vergences = torch.tensor([far, 8 - far], dtype=torch.float64)
+    pixels = PixelGrid(pitch, (whole, whole), 1.0, True, torch.float64)
+    query = lens.question(Points(vergences), wavelength_grid(count=3), pixels)
+    found, psfs, border = RADIAL.transfer(query), RADIAL(query), (whole - side) // 2
+    light = [found(torch.zeros(1, dtype=torch.float64), (n, n), range(3))[..., 0, 0] for n in (whole, side)]
+    missed = psfs.sum((-2, -1)) - psfs[..., border:-border, border:-border].sum((-2, -1))
+    torch.testing.assert_close(light[0] - light[1], missed, rtol=0.1, atol=2e-6)
+
+
 @pytest.mark.parametrize("orders", [ORDERS, QUADRATURE])
 @pytest.mark.parametrize("order", [1.0, 1.25, 1.5, 2.0])
 @pytest.mark.parametrize("total", [28, 33, 9])

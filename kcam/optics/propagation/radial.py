@@ -36,6 +36,7 @@ _EVEN = 128  # steps by which tables grow, so that a lens that is focused anew f
 _FEWEST = 256  # frequencies in a table of transfer functions
 _BEYOND_RAYS = 80.0  # times what the rim diffracts beyond all, for transfer functions
 _TAIL = 64  # rings of what it diffracts farther
+_AT_RIM = 1e-3  # of a radius, from its rim to where the slope there is told
 _CUBIC, _EIGHT = range(-1, 3), range(-3, 5)  # points on both sides of a value between them
 _NEAR_0 = (0.0947421, -0.0124339, 0.0010251)
 """Of f(t) t at 0, h and 2 h, beside the trapezium rule's weights: what Euler and Maclaurin add to it, to h^8."""
@@ -98,12 +99,13 @@ class RadialTransfer:
     H(f) = 1 / (2 pi E) INT |U(t)|^2 J0(kappa t) t dt,   kappa = f lambda d / a
 
     of what falls into a window in the mean over directions, times that of a pixel, folded at the pixels' frequency.
-    Well beyond its rays light is diffracted at the rim alone: T / r of it falls outside a radius r, see `Lens.window`.
+    Well beyond its rays light is diffracted at the rims alone, half of it towards the axis: outside a radius r falls
+    T r / (r^2 - b^2), of which `Lens.window` tells T, around where the rays at a rim fall, b.
 
     Args:      light: |U|^2 t dt / (2 pi E) at even t, (L, Z, T), with Euler and Maclaurin's corrections near 0.
                kernel: J0(kappa t) at even kappa up to 2, (T, K).
                step: of t [pixels], (L,). kappa: entries of the kernel for each cycle per pixel, (L,).
-               rim: T [pixels], (L,).
+               rims: of each rim T, (R, L, 1), and b, (R, L, Z) [pixels].
                active: width of the light-sensitive part of a pixel; 0 where no pixel is integrated over.
     """
 
@@ -111,7 +113,7 @@ class RadialTransfer:
     kernel: Tensor
     step: Tensor
     kappa: Tensor
-    rim: Tensor
+    rims: tuple[Tensor, Tensor]
     active: float
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
@@ -126,21 +128,25 @@ class RadialTransfer:
         place = (kappa[:, None] * asked.abs()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
         value = even_between(table, place) * weights
         found = value.new_zeros(*value.shape[:-1], len(frequencies)).index_add(-1, index, value)
-        found = found + self._beyond(frequencies, shape, chosen)[:, None]
+        found = found + self._beyond(frequencies, shape, chosen)
         return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
 
     def _beyond(self, frequencies: Tensor, shape: tuple[int, int], chosen: Tensor) -> Tensor:
-        """Of the light in a window beyond the table, INT share(r) J0(2 pi f r) T dr / r^2, (L, F)."""
-        reach = (self.light.shape[-1] - 0.5) * self.step[chosen, None]  # the last step goes half as far again
+        """Of the light in a window beyond the table, INT share(r) J0(2 pi f r) dT/dr dr, (L, Z, F)."""
+        reach = (self.light.shape[-1] - 0.5) * self.step[chosen, None, None]  # the last step goes half as far again
         nearest, corner = float(reach.detach().min()), math.hypot(*shape) / 2
         if nearest >= corner:
-            return torch.zeros((), dtype=torch.float64, device=reach.device)[None]
-        # even steps of 1 / r, of which each wavelength takes those beyond its own reach
-        steps = torch.linspace(1 / corner, 1 / nearest, _TAIL + 1, dtype=torch.float64, device=reach.device)
-        radius = 2 / (steps[1:] + steps[:-1])
+            return torch.zeros((), dtype=torch.float64, device=reach.device)
+        much, around = (part[:, chosen, :, None] for part in self.rims)
+        # even steps of 1 / (r - b), of which each wavelength takes those beyond its own reach
+        rim = float(around.detach().max())
+        steps = torch.linspace(1 / (corner - rim), 1 / (nearest - rim), _TAIL + 1, dtype=torch.float64)
+        edges = rim + 1 / steps.to(reach)
+        radius = rim + 2 / (steps[1:] + steps[:-1]).to(reach)
+        outside = edges.clamp(min=reach)  # (L, 1, R)
+        width = (much * outside / (outside**2 - around**2)).sum(0).diff()
         rings = BesselJ0.apply(2 * math.pi * frequencies[:, None] * radius)
-        width = torch.minimum((1 / reach - steps[:-1]).clamp(min=0), steps.diff())  # (L, R)
-        return (width * _share_inside(shape, radius)) @ rings.T * self.rim[chosen, None]
+        return (width * _share_inside(shape, radius)) @ rings.T
 
 
 def radial_transfer(query: Query) -> RadialTransfer:
@@ -163,9 +169,22 @@ def radial_transfer(query: Query) -> RadialTransfer:
         kernel=_even_kernel(count, step=step * 2 / (count - 1), device=query.device)[: len(t)],
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
-        rim=rim / pitch,
+        rims=_rims(query, rim / pitch),
         active=query.grid.active if query.grid.integrate else 0.0,
     )
+
+
+def _rims(query: Query, diffracted: Tensor) -> tuple[Tensor, Tensor]:
+    """What each rim of the aperture diffracts, (R, L, 1), of so much (L,), and how far its rays fall, (R, L, Z), in
+    pixels.
+    """
+    radii = diffracted.new_tensor([radius for radius, _ in query.lens.aperture.discs()])
+    rho = radii[:, None] * (1 - _AT_RIM * torch.arange(2).to(radii))
+    image_side = rho * torch.sqrt((1 + query.tau) / (1 + query.tau * rho**2))
+    coefficients, maps = residual_path(query, query.pupil(rho, torch.zeros_like(rho)))
+    slopes = (coefficients @ (maps.diff() / image_side.diff())[..., 0]).abs().permute(2, 0, 1)
+    fallen = slopes * (query.sensor_distance / (query.image_side_semi_aperture * query.pixel_pitch))
+    return (radii / radii.sum())[:, None, None] * diffracted[:, None], fallen
 
 
 def _share_inside(shape: tuple[int, int], radius: Tensor) -> Tensor:
