@@ -341,7 +341,10 @@ class Imaging(Stage):
 
     def defocus(self, wavelengths: Tensor) -> Defocus:
         """How far light that is out of focus goes: see `source.Defocus`; wavelengths (L,) [m]."""
-        return self.lens.defocus(wavelengths, self.pixel_pitch) if self.accuracy.blur else Defocus()
+        if not self.accuracy.blur:
+            return Defocus()
+        find = functools.partial(self.lens.defocus, wavelengths, self.pixel_pitch)
+        return find() if self.known is None else self.known.once((self.lens,), tuple(wavelengths.tolist()), find)
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the bands of a scene at one distance, (Z, L, h, w) in the dtype and on the device of `like`; kept

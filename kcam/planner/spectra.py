@@ -102,6 +102,7 @@ class Spectra:
         self._framed = torch.ones_like(self._unlike)  # see `frame`
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
+        self._energies_known: dict[tuple[Any, ...], Tensor] = {}
 
     @classmethod
     def of(
@@ -165,9 +166,16 @@ class Spectra:
         """The energy of each row with some settings, (B,)."""
         found = torch.zeros(len(self.scene.coefficients), dtype=torch.float64)
         for index, (rows, _) in enumerate(self.groups):
-            layered = self._of(index, settings.get("layers"))
-            found[rows] = self._energy(self._once(index, layered, settings, settings, way), layered)
+            found[rows] = self._all_of_it(index, settings, way)
         return found
+
+    def _all_of_it(self, index: int, settings: Mapping[str, Any], way: Way) -> Tensor:
+        """The energy of each row of a group with some settings; kept, because choices are compared with the same."""
+        key = index, way, *sorted(settings.items())
+        if key not in self._energies_known:
+            layered = self._of(index, settings.get("layers"))
+            self._energies_known[key] = self._energy(self._once(index, layered, settings, settings, way), layered)
+        return self._energies_known[key]
 
     @functools.cached_property
     def grey(self) -> Spectra:
@@ -302,7 +310,7 @@ class Spectra:
             layered = self._of(index, against.get("layers"))
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, against, way) for own in (against, changes))
-            found[0, rows], found[1, rows] = (self._energy(mixed, layered) for mixed in (ours - theirs, theirs))
+            found[0, rows], found[1, rows] = self._energy(ours - theirs, layered), self._all_of_it(index, against, way)
             if len(layered.vergences) > 1 and self._hides:
                 found[0, rows] *= self._replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]

@@ -27,8 +27,8 @@ from kcam.optics.source import Points
 from kcam.precision import full_precision
 
 _KAPPA = 1.5  # samples along a row for each fringe that reaches the window
-_ROWS = 48  # of a smooth pupil at least, and one for so many samples along it
-_PER_ROW = 6
+_ROWS = 32  # of a smooth pupil at least, and one for so many samples along it
+_PER_ROW = 8
 _SAMPLED = 32  # rows of a map of pixels at least, fewer than twice as many
 _PASSED = 12  # half width of the low-pass along v, in samples at its Nyquist
 _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
