@@ -100,9 +100,12 @@ class LineTransfer:
 
     @staticmethod
     def _inside(shape: tuple[int, int], step: Tensor, x: Tensor) -> Tensor:
-        """What of the light at so many steps (N,), of (L,) pixels, falls into a window along x and y, (L, 2, 1, N)."""
+        """What of the light at so many steps (N,), of (L,) pixels, falls into a window along x and y, (L, 2, 1, N): of
+        light that is linear between its steps, for an edge that moves with the wavelength.
+        """
         halves = step.new_tensor([shape[1], shape[0]])[:, None] / 2
-        return (halves / step[:, None, None] - x.abs() + 0.5).clamp(0, 1)[:, :, None]
+        within = (halves / step[:, None, None] - x.abs()).clamp(-1, 1)
+        return (0.5 + within - within * within.abs() / 2)[:, :, None]
 
 
 class _Spreads:
