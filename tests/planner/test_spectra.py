@@ -1055,8 +1055,9 @@ def test_cross_spectra_are_sums_over_rings(seed: int, dark: bool) -> None:
     flat = planes.double().flatten(1)
     torch.testing.assert_close(found.sum((0, 1)), flat @ flat.T, rtol=1e-4, atol=1e-4)
     if dark:
-        spectrum = torch.fft.fft2(planes.double(), s=(2 * height, 2 * width), norm="ortho")
-        fy, fx = (torch.fft.fftfreq(2 * n, dtype=torch.float64).abs() for n in (height, width))
+        sides = cross_spectra.padded(height), cross_spectra.padded(width)
+        spectrum = torch.fft.fft2(planes.double(), s=sides, norm="ortho")
+        fy, fx = (torch.fft.fftfreq(side, dtype=torch.float64).abs() for side in sides)
     else:
         spectrum = torch.as_tensor(scipy.fft.dctn(planes.double().numpy(), axes=(-2, -1), norm="ortho"))
         fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in (height, width))
