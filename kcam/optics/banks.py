@@ -37,7 +37,7 @@ class KnownPSFs:
 
     ends: wavelengths (2,) that are computed with those asked for, so that any part of a spectrum is computed alike.
     psfs: (h, w), by all that they depend on. windows: by what was asked. others: what else is known of the same optics,
-    see `keep`. seen: of scenes, see `once`.
+    see `keep`. seen: of scenes and lenses, see `once`.
     """
 
     remembers: ClassVar[bool] = True  # and is no part of what a stage is, see `cache.value_of`
@@ -82,7 +82,9 @@ class KnownPSFs:
             self.others[key] = value
 
     def once(self, parts: tuple[object, ...], how: object, look: Callable[[], T]) -> T:
-        """What a look at parts of a scene tells, which stay as they are and the same objects; how: and what else."""
+        """What a look at parts of a scene, or of optics, tells, which stay as they are and the same objects; how: and
+        what else.
+        """
         key = *map(id, parts), how
         if key not in self.seen:
             self.seen[key] = parts, look()  # held, so that nothing else gets their place

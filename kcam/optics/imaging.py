@@ -344,7 +344,8 @@ class Imaging(Stage):
         if not self.accuracy.blur:
             return Defocus()
         find = functools.partial(self.lens.defocus, wavelengths, self.pixel_pitch)
-        return find() if self.known is None else self.known.once((self.lens,), tuple(wavelengths.tolist()), find)
+        how = "defocus", self.pixel_pitch, *wavelengths.tolist()
+        return find() if self.known is None else self.known.once((self.lens,), how, find)
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the bands of a scene at one distance, (Z, L, h, w) in the dtype and on the device of `like`; kept

@@ -12,7 +12,7 @@ from torch import Tensor
 _FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings are 1/8 wide below the second, then even,
 _EDGE = 2.0**-6  # and in the corners of the pixels' frequencies
 _PART = 32  # frequencies that are summed at once
-_DARK = 1.5  # sides of a picture, with the dark beside it: errors are 0.96 to 1.08 times those with 4 (5 to 95 %)
+_DARK = 1.5  # sides of a picture, with the dark beside it: errors are 0.96 to 1.08 times those with 4 sides (5 to 95 %)
 
 
 def rings() -> Tensor:
@@ -44,7 +44,7 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
 
 
 def padded(side: int) -> int:
-    """Of a side with the dark beside it: half as much, which little light crosses."""
+    """Of a side with the dark beside it: half as much, which little light crosses; even, and as FFTs like it."""
     return 2 * scipy.fft.next_fast_len(math.ceil(_DARK * side / 2))
 
 

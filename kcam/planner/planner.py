@@ -143,11 +143,10 @@ class Planner:
         """The plan for a tolerance."""
         start = time.perf_counter()
         check_tolerance(tolerance)
-        ladders: list[Ladder] = []
-        skips: list[Skip] = []
+        rows = _Rows(self.prices)
         shortcuts: dict[int, dict[str, Any] | None] = {}
-        allowed, checked, planned = 0.0, None, tolerance != 0 and bool(self.evaluator.samples)
-        if planned:
+        allowed, checked = 0.0, None
+        if tolerance != 0 and self.evaluator.samples:
             ladders, skips = self._ways()
             noise = self.evaluator.noise()
             allowed = noise if isinstance(tolerance, str) else float(tolerance)
@@ -158,8 +157,8 @@ class Planner:
                 choice.position = 0
             checked = self._settle(ladders, skips, allowed, noise if isinstance(tolerance, str) else None)
             shortcuts = shortcuts_of(skips, allowed, noise if isinstance(tolerance, str) else None)
-        rows = _Rows(self.prices, _changes(ladders) if self.one else {})
-        if planned:
+            if self.one:
+                rows.change(_changes(ladders))  # priced at once
             for ladder in _relevant(ladders):
                 rows.add_ladder(ladder)
             rows.add_way()
@@ -365,12 +364,12 @@ def _urgency(way: Ladder | Skip) -> float:
 
 
 class _Rows:
-    """The decisions, one after the other, and what is spent after each, beside changes that are priced at once."""
+    """The decisions, one after the other, and what is spent after each."""
 
-    def __init__(self, price: Prices, changes: Mapping[str, Any]) -> None:
+    def __init__(self, price: Prices) -> None:
         self.price = price
         self.decisions: list[Decision] = []
-        self.changes: dict[str, Any] = price.always | dict(changes)
+        self.changes: dict[str, Any] = dict(price.always)
         self.spent, self.beside = price.of(self.changes), sum(price.stages.values())
 
     def _add(self, effect: str, chosen: str, instead: str, why: str, error: float = 0.0, counted: bool = True) -> None:
@@ -378,10 +377,14 @@ class _Rows:
             Decision(effect, chosen, instead, why, error, counted, self.spent[0] + self.beside, self.spent[1])
         )
 
+    def change(self, changes: Mapping[str, Any]) -> None:
+        """Of the optics."""
+        self.changes |= changes
+        self.spent = self.price.of(self.changes)
+
     def add_ladder(self, ladder: Ladder) -> None:
         """A choice of optics."""
-        self.changes |= ladder.level.changes
-        self.spent = self.price.of(self.changes)
+        self.change(ladder.level.changes)
         top = ladder.levels[-1].label
         instead = "" if ladder.level.label == top else top
         self._add(ladder.effect, ladder.level.label, instead, ladder.why(), ladder.error)
@@ -393,8 +396,7 @@ class _Rows:
         before = self.spent[0]
         after = self.price.of(self.changes | {"direct": True})[0]
         if after < before:
-            self.changes |= {"direct": True}
-            self.spent = self.price.of(self.changes)
+            self.change({"direct": True})
             self._add("convolution", "direct", "by FFT", f"{before / max(after, 1e-12):.2g} times as fast")
         else:
             self._add("convolution", "by FFT", "", "")

@@ -300,10 +300,9 @@ class Spectra:
             way = Way.LINES
         # layers lie between others, and windows cut the same off all of them: 1.0 to 1.2 times the truth, measured
         corners = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
-        factor, replaced = torch.tensor(corners, dtype=torch.float64), self._replaced
-        if not _differ(changes, against, LINEAR - COLOURS):
+        factor, colours = torch.tensor(corners, dtype=torch.float64), not _differ(changes, against, LINEAR - COLOURS)
+        if colours:
             factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
-            replaced = torch.where(self.few_lights, _HIDDEN_LIGHTS, replaced)
         if _differ(changes, against, {"interpolate_bands"}):
             factor = factor * self.optics.between_psfs
         if changes.get("propagator") == against.get("propagator") == "fresnel":
@@ -314,6 +313,7 @@ class Spectra:
             theirs, ours = (self._once(index, layered, own, against, way) for own in (against, changes))
             found[0, rows], found[1, rows] = self._energy(ours - theirs, layered), self._all_of_it(index, against, way)
             if len(layered.vergences) > 1 and self._hides:
+                replaced = torch.where(self.few_lights & colours, _HIDDEN_LIGHTS, self._replaced)
                 found[0, rows] *= replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]
 

@@ -29,7 +29,8 @@ from kcam.scene import Scene
 
 _BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
 _ASKED = 4  # PSFs, up to how many a choice of wavelengths is mostly asked about: their line spreads are known as well,
-_NEAR = 0.35  # and stand for those of the others where they are so near, in steps
+_NEAR, _APART = 0.35, 0.25  # and stand for those of others where they are so near, in steps; of two less far apart than
+# the latter cubics take one
 GROUPS = 7  # PSFs, up to whose number errors are told so: 0.9 to 1.15 times what they are by each band's own line
 # spread (5 to 95 % of 36 deep scenes behind maps), and 0.9 to 1.3 of PSFs between others, of which 6 are told worst
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
@@ -111,10 +112,14 @@ class Transfers:
     def _standing(self, most: int) -> Tensor:
         """Wavelengths whose PSFs may stand for others: those of a few that tell of others, and of so many at most."""
         own, deep = self.wavelengths, self.deep
-        few: list[dict[str, Any]] = [{"bands": 1}, {"bands": FEW_BANDS}]
-        few += [{"bands": n} for n in group_counts(len(own)) if n <= most] if deep else []
-        few += [] if deep else [interpolated(n) for n in node_counts(len(own)) if n <= most]
+        counts = [n for n in (group_counts if deep else node_counts)(len(own)) if n <= most]
+        few = [{"bands": 1}, {"bands": FEW_BANDS}, *({"bands": n} if deep else interpolated(n) for n in counts)]
         return torch.cat([self.stage(one).psf_wavelengths(own, deep=deep) for one in few]).unique()
+
+    @functools.cached_property
+    def _asked(self) -> Tensor:
+        """Those that choices mostly ask for."""
+        return self._standing(_ASKED)
 
     @functools.cached_property
     def _every(self) -> Tensor:
@@ -138,7 +143,7 @@ class Transfers:
         shares = imaging.shares(wavelengths, deep=self.deep)
         many = way is Way.BETWEEN_LINES and shares is None and len(groups) > _BETWEEN_LINES
         if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
-            groups = _ends_and_between(wavelengths, _BETWEEN_LINES, self._standing(_ASKED))
+            groups = _ends_and_between(wavelengths, _BETWEEN_LINES, self._asked)
             shares = _cubics(groups, wavelengths)
         return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
 
@@ -312,7 +317,10 @@ def _ends_and_between(wavelengths: Tensor, count: int, known: Tensor) -> Tensor:
     found = wavelengths[(numbers - even[:, None]).abs().argmin(1)]
     off, nearest = (1 / known - even[1:-1, None]).abs().min(1)
     found[1:-1] = torch.where(off < _NEAR * (even[1] - even[0]), known[nearest], found[1:-1])
-    return found.unique()
+    found = found.unique()
+    apart = -(1 / found).diff() > _APART * (even[1] - even[0])
+    apart[-2] &= apart[-1]  # the last but one, from the one before and from the end
+    return torch.cat([found[:1], found[1:-1][apart[:-1]], found[-1:]])
 
 
 def _cubics(nodes: Tensor, wavelengths: Tensor) -> Tensor:

@@ -95,6 +95,28 @@ def test_what_falls_into_a_smaller_window_is_about_told(kind: str, seed: int) ->
         assert 0.9 < norm(found) / norm(expected) < 1.7
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_edges_of_windows_cut_light_that_is_linear_between_steps(seed: int) -> None:
+    """Wherever they fall, also between two steps around the middle: an edge that goes on in whole steps as these grow
+    with the wavelength would be told as colour.
+    """
+    draw = Draw(seed)
+    count, step = draw.whole(20, 60), torch.tensor([draw.number(0.05, 5), draw.number(0.05, 5)], dtype=torch.float64)
+    shape = draw.whole(1, 40), draw.whole(1, 40)
+    light, x = draw.noise(count).double(), torch.fft.fftfreq(count, 1 / count, dtype=torch.float64)
+    found = (light * lines.LineTransfer._inside(shape, step, x)).sum(-1)[..., 0]  # (L, 2)
+    order = x.argsort()
+    for own, along in zip(step, found, strict=True):
+        for half, told in zip((shape[1] / 2, shape[0] / 2), along, strict=True):
+            end = min(half / float(own), count)
+            fine = torch.linspace(-end, end, 200_001, dtype=torch.float64)
+            padded = torch.nn.functional.pad(light[order], (1, 1))
+            low = (fine - float(x.min()) + 1).clamp(0, count + 1)
+            before = low.floor().clamp(max=count).long()
+            between = torch.lerp(padded[before], padded[before + 1], low - before)
+            assert float(told) == pytest.approx(float(torch.trapezoid(between, fine)), rel=1e-3, abs=1e-4)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(4))
 def test_distances_take_what_others_have_found(kind: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:

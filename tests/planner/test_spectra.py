@@ -321,15 +321,35 @@ def test_windows_hold_the_light_that_transfer_functions_begin_with(seed: int, sh
     torch.testing.assert_close(found, RADIAL(query).sum((-2, -1)), rtol=0, atol=2e-4)
 
 
+def test_a_lamp_between_layers_may_be_in_focus() -> None:
+    """Where three layers over a ramp show it out of focus, and its colours less than half as far apart."""
+    lens = optics.Lens(optics.CircularAperture(3.2 * mm), optics.ThinLens(25 * mm), focus_distance=0.9)
+    imaging = optics.Imaging(lens, pixel_pitch=3 * um)
+    vergences = torch.linspace(1 / 1.6, 1 / 0.76, 96, dtype=torch.float64).expand(1, 1, 64, 96)
+    lamps = torch.full((3, 64, 96), 1e-5)
+    lamps[:, 20::24, int((vergences[0, 0, 0] - 1 / 0.9).abs().argmin())] = 0.9
+    camera = Camera(imaging, sensor.ColourFilter.nikon(), sensor.Mosaic("RGGB"))
+    scene = Scene.from_rgb(lamps, depth=1 / vergences)
+    with torch.no_grad():
+        planner = Planner(camera, scene)
+        ways, _ = planner._ways()
+        colours = next(ladder for ladder in ways if ladder.effect == "wavelengths")
+        assert planner.evaluator.few_lights
+        few, beside = colours.levels[0].changes, colours.beside
+        told, raw = planner.evaluator.error(beside | few, beside), noiseless_raw(camera)
+        truth = relative_rms(with_imaging(raw, **few)(scene), raw(scene))
+    assert 0.9 < told / truth < 2.5, f"{told:.3g}, truly {truth:.3g}"
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_rims_diffract_light_around_where_their_rays_fall(seed: int) -> None:
     """What falls just outside a window wider than the blur, of a round lens or an annulus out of focus: of light around
     the axis a quarter of it would be told.
     """
     draw = Draw(seed)
-    side = draw.whole(65, 201) // 2 * 2 + 1
+    side = draw.whole(65, 301) // 2 * 2 + 1
     whole = side * 5 // 8 * 2 + 1
-    pitch, semi = draw.number(3, 6) * um, draw.number(6, 13) * mm
+    pitch, semi = draw.number(3, 6) * um, draw.number(6, 13.8) * mm if seed else 13.8 * mm  # up to f/1.8
     blurred = draw.number(0.3, 0.4) * side * pitch  # where the rays at the rim fall
     aperture = optics.AnnularAperture(2 * semi, obscuration=draw.one_of(0.0, draw.number(0.1, 0.5)))
     lens = optics.Lens(aperture, optics.ThinLens(50 * mm), focus_distance=0.25)

@@ -103,9 +103,9 @@ class LineTransfer:
         """What of the light at so many steps (N,), of (L,) pixels, falls into a window along x and y, (L, 2, 1, N): of
         light that is linear between its steps, for an edge that moves with the wavelength.
         """
-        halves = step.new_tensor([shape[1], shape[0]])[:, None] / 2
-        within = (halves / step[:, None, None] - x.abs()).clamp(-1, 1)
-        return (0.5 + within - within * within.abs() / 2)[:, :, None]
+        edges = step.new_tensor([shape[1], shape[0]])[:, None] / 2 / step[:, None, None]
+        within = torch.stack([edges - x, edges + x]).clamp(-1, 1)  # of either edge
+        return (within - within * within.abs() / 2).sum(0)[:, :, None]
 
 
 class _Spreads:

@@ -36,7 +36,7 @@ _EVEN = 128  # steps by which tables grow, so that a lens that is focused anew f
 _FEWEST = 256  # frequencies in a table of transfer functions
 _BEYOND_RAYS = 80.0  # times what the rim diffracts beyond all, for transfer functions
 _TAIL = 64  # rings of what it diffracts farther
-_AT_RIM = 1e-3  # of a radius, from its rim to where the slope there is told
+_AT_RIM = 1e-6  # of a radius, from its rim to where the slope there is told
 _CUBIC, _EIGHT = range(-1, 3), range(-3, 5)  # points on both sides of a value between them
 _NEAR_0 = (0.0947421, -0.0124339, 0.0010251)
 """Of f(t) t at 0, h and 2 h, beside the trapezium rule's weights: what Euler and Maclaurin add to it, to h^8."""
@@ -132,17 +132,18 @@ class RadialTransfer:
         return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
 
     def _beyond(self, frequencies: Tensor, shape: tuple[int, int], chosen: Tensor) -> Tensor:
-        """Of the light in a window beyond the table, INT share(r) J0(2 pi f r) dT/dr dr, (L, Z, F)."""
+        """Of the light in a window beyond the table, INT share(r) J0(2 pi f r) (-dP / dr) dr of P = sum of
+        T r / (r^2 - b^2), (L, Z, F).
+        """
         reach = (self.light.shape[-1] - 0.5) * self.step[chosen, None, None]  # the last step goes half as far again
-        nearest, corner = float(reach.detach().min()), math.hypot(*shape) / 2
-        if nearest >= corner:
-            return torch.zeros((), dtype=torch.float64, device=reach.device)
         much, around = (part[:, chosen, :, None] for part in self.rims)
+        nearest, rim, corner = float(reach.detach().min()), float(around.detach().max()), math.hypot(*shape) / 2
+        if corner <= max(nearest, rim):
+            return torch.zeros((), dtype=torch.float64, device=reach.device)
         # even steps of 1 / (r - b), of which each wavelength takes those beyond its own reach
-        rim = float(around.detach().max())
-        steps = torch.linspace(1 / (corner - rim), 1 / (nearest - rim), _TAIL + 1, dtype=torch.float64)
-        edges = rim + 1 / steps.to(reach)
-        radius = rim + 2 / (steps[1:] + steps[:-1]).to(reach)
+        ends = 1 / (corner - rim), 1 / (nearest - rim)
+        steps = torch.linspace(*ends, _TAIL + 1, dtype=torch.float64, device=reach.device)
+        edges, radius = rim + 1 / steps, rim + 2 / (steps[1:] + steps[:-1])
         outside = edges.clamp(min=reach)  # (L, 1, R)
         width = (much * outside / (outside**2 - around**2)).sum(0).diff()
         rings = BesselJ0.apply(2 * math.pi * frequencies[:, None] * radius)
@@ -155,8 +156,9 @@ def radial_transfer(query: Query) -> RadialTransfer:
     a, d = query.image_side_semi_aperture, query.sensor_distance
     scales = 2 * math.pi / wavelengths * a / d
     rim = wavelengths * d / (2 * math.pi**2) * query.lens.rim_per_area()
-    corner = math.hypot(*query.half_sides) * query.pixel_pitch
-    reach = min(corner, float(query.displacement.max()) + float(_BEYOND_RAYS * rim.detach().max()))
+    corner, rims = math.hypot(*query.half_sides) * query.pixel_pitch, _rims(query, rim / pitch)
+    rays = max(float(query.displacement.max()), float(rims[1].detach().max()) * pitch)
+    reach = min(corner, rays + float(_BEYOND_RAYS * rim.detach().max()))
     intensity, energy = _light(query, scales, reach, finer=_EVEN_FINER)
     step = _SUMMED / _EVEN_FINER
     t = torch.arange(intensity.shape[-1], dtype=torch.float64, device=query.device) * step
@@ -169,7 +171,7 @@ def radial_transfer(query: Query) -> RadialTransfer:
         kernel=_even_kernel(count, step=step * 2 / (count - 1), device=query.device)[: len(t)],
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
-        rims=_rims(query, rim / pitch),
+        rims=rims,
         active=query.grid.active if query.grid.integrate else 0.0,
     )
 
@@ -178,8 +180,8 @@ def _rims(query: Query, diffracted: Tensor) -> tuple[Tensor, Tensor]:
     """What each rim of the aperture diffracts, (R, L, 1), of so much (L,), and how far its rays fall, (R, L, Z), in
     pixels.
     """
-    radii = diffracted.new_tensor([radius for radius, _ in query.lens.aperture.discs()])
-    rho = radii[:, None] * (1 - _AT_RIM * torch.arange(2).to(radii))
+    radii, weights = diffracted.new_tensor(query.lens.aperture.discs()).T
+    rho = radii[:, None] * (1 - _AT_RIM * torch.arange(2).to(radii) * weights.sign()[:, None])  # on the open side
     image_side = rho * torch.sqrt((1 + query.tau) / (1 + query.tau * rho**2))
     coefficients, maps = residual_path(query, query.pupil(rho, torch.zeros_like(rho)))
     slopes = (coefficients @ (maps.diff() / image_side.diff())[..., 0]).abs().permute(2, 0, 1)
