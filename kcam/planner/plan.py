@@ -23,7 +23,7 @@ from kcam.optics.imaging import is_deep
 from kcam.plain import from_json
 from kcam.planner.range import Range
 from kcam.planner.survey import survey
-from kcam.planner.table import duration, table
+from kcam.planner.table import table
 from kcam.scene import Scene
 from kcam.sensor import ADC
 
@@ -233,9 +233,7 @@ class Plan:
         fewer = [f"{row.effect} {row.chosen} (of {row.instead})" for row in told if row.chosen != "left out"]
         without = [row.effect for row in told if row.chosen == "left out"]
         parts = [*(fewer and [", ".join(fewer)]), *(without and [f"without {', '.join(without)}"])]
-        if not parts:
-            return f"nothing left out: optics and sensor take about {duration(self.seconds)}"
-        return f"within {self.allowed:.2g}: {'; '.join(parts)}"
+        return f"within {self.allowed:.2g}: {'; '.join(parts)}" if parts else "nothing left out"
 
 
 def _read(text: str | bytes, wrong: str) -> Plan:
