@@ -263,8 +263,8 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]
     else:
         few = [interpolated(n) for n in node_counts(view.bands)]
-    few_layers = view.layers <= FEW_LAYERS
-    if view.one and successive and few_layers and not view.stand_in:  # half of the PSFs would save what that takes
+    shallow = view.layers <= FEW_LAYERS
+    if view.one and successive and shallow and not view.stand_in:  # half of the PSFs would save what that takes
         few = [changes for changes in few if 3 * changes["bands"] <= view.bands]
     levels = [Level(f"{n} PSFs" if (n := changes["bands"]) > 1 else "1 PSF", changes, n) for changes in few]
     yield Ladder(

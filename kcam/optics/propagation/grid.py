@@ -21,7 +21,7 @@ from kcam.optics.propagation.lines import lines
 from kcam.optics.propagation.question import Query, residual_amplitude, residual_path
 from kcam.optics.propagation.row import FFT_SLOWNESS, PRODUCTS, Propagator
 from kcam.optics.propagation.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Transform
-from kcam.optics.pupil.coordinates import EDGE_MARGIN, from_image_side, grid_nodes, grid_spacing
+from kcam.optics.pupil.coordinates import EDGE_MARGIN, from_image_side, grid_nodes, grid_spacing, to_image_side
 from kcam.optics.pupil.quadrants import unfold
 from kcam.optics.pupil.rim import round_weights
 from kcam.optics.pupil.warp import Warp
@@ -219,7 +219,7 @@ def _disc_weights(query: Query, *, count: int, spacing: float) -> Tensor:
     """Quadrature weights of an aperture made of discs, for x, y > 0."""
 
     def rims(tau: float) -> Tensor:
-        discs = ((r * math.sqrt((1 + tau) / (1 + tau * r**2)), weight) for r, weight in query.lens.aperture.discs())
+        discs = ((to_image_side(radius, tau), weight) for radius, weight in query.lens.aperture.discs())
         return round_weights(tuple(discs), count, spacing=spacing)
 
     return _following(query.tau.cpu(), rims, spacing=spacing).to(query.device)

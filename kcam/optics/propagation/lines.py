@@ -20,15 +20,15 @@ from kcam.optics.numerics import Pair, fast_length, lagrange, lagrange_weights, 
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.cells import cell_edges, looked_up, sizes
 from kcam.optics.propagation.question import Query, residual_amplitude, residual_path
-from kcam.optics.pupil.coordinates import Pupil, from_image_side, grid_nodes, grid_spacing
+from kcam.optics.pupil.coordinates import Pupil, from_image_side, grid_nodes, grid_spacing, to_image_side
 from kcam.optics.pupil.maps import pixel_weights
 from kcam.optics.pupil.rim import edge_profile
 from kcam.optics.source import Points
 from kcam.precision import full_precision
 
 _KAPPA = 1.5  # samples along a row for each fringe that reaches the window
-_ROWS = 32  # of a smooth pupil at least, and one for so many samples along it
-_PER_ROW = 8
+_ROWS = 32  # of a smooth pupil at least, and one for so many samples along it: errors are 0.99 to 1.2 times what three
+_PER_ROW = 8  # times as many rows tell (5 to 95 % of 414 choices before 69 pupils)
 _SAMPLED = 32  # rows of a map of pixels at least, fewer than twice as many
 _PASSED = 12  # half width of the low-pass along v, in samples at its Nyquist
 _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
@@ -341,8 +341,7 @@ def _rim(query: Query, rows: Tensor, nodes: Tensor) -> Tensor:
     """Quadrature weights along each row of an aperture made of discs, (R, N)."""
     spacing, weights = float(nodes[1] - nodes[0]), []
     for radius, weight in query.lens.aperture.discs():
-        reach = radius * torch.sqrt((1 + query.tau) / (1 + query.tau * radius**2))
-        chord = (reach**2 - rows**2).clamp(min=0).sqrt()[:, None]
+        chord = (to_image_side(radius, query.tau) ** 2 - rows**2).clamp(min=0).sqrt()[:, None]
         weights.append(weight * edge_profile((chord - nodes.abs()) / spacing) * (chord > 0))
     return torch.stack(weights).sum(0) if weights else torch.ones(len(rows), len(nodes)).to(rows)
 

@@ -19,7 +19,7 @@ from kcam.optics.propagation.estimates import paraxial_error, trace
 from kcam.optics.propagation.question import Query, radial_phase, residual_path
 from kcam.optics.propagation.rings import fewer_nodes, panel_nodes, panel_orders
 from kcam.optics.propagation.row import Propagator, Rate
-from kcam.optics.pupil.coordinates import Pupil, from_image_side
+from kcam.optics.pupil.coordinates import Pupil, from_image_side, to_image_side
 from kcam.optics.pupil.rim import kaiser_sinc
 
 _SUMMED = math.pi / 2  # step of t at which the pupil is summed up: a disc of radius 1 has no frequency above 1
@@ -182,9 +182,8 @@ def _rims(query: Query, diffracted: Tensor) -> tuple[Tensor, Tensor]:
     """
     radii, weights = diffracted.new_tensor(query.lens.aperture.discs()).T
     rho = radii[:, None] * (1 - _AT_RIM * torch.arange(2).to(radii) * weights.sign()[:, None])  # on the open side
-    image_side = rho * torch.sqrt((1 + query.tau) / (1 + query.tau * rho**2))
     coefficients, maps = residual_path(query, query.pupil(rho, torch.zeros_like(rho)))
-    slopes = (coefficients @ (maps.diff() / image_side.diff())[..., 0]).abs().permute(2, 0, 1)
+    slopes = (coefficients @ (maps.diff() / to_image_side(rho, query.tau).diff())[..., 0]).abs().permute(2, 0, 1)
     fallen = slopes * (query.sensor_distance / (query.image_side_semi_aperture * query.pixel_pitch))
     return (radii / radii.sum())[:, None, None] * diffracted[:, None], fallen
 
@@ -281,7 +280,7 @@ def ring_nodes(query: Query, frequency: float, *, density: float = 1.0) -> tuple
         )
     # edges move with tau, for a step there moves light; 0 and 1 do not, and nodes without a gradient cost less
     tau = query.tau if edges.numel() > 2 or inner > 0 else query.tau.detach()
-    return panel_nodes(edges * torch.sqrt((1 + tau) / (1 + tau * edges**2)), orders)
+    return panel_nodes(to_image_side(edges, tau), orders)
 
 
 def ring_amplitude(query: Query, pupil: Pupil, quadrature: Tensor) -> tuple[Tensor, Tensor]:

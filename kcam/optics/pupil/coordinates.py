@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,6 +82,11 @@ def grid_nodes(count: int, *, spacing: float | None = None) -> Tensor:
 def grid_spacing(count: int) -> float:
     """Spacing of `grid_nodes` in units of the semi-aperture."""
     return 2.0 / (count - 2 * EDGE_MARGIN)
+
+
+def to_image_side(rho: Any, tau: Any) -> Any:
+    """Image-side radius of a true one, a tensor or a number each: rho'^2 = rho^2 (1 + tau) / (1 + tau rho^2)."""
+    return rho * ((1 + tau) / (1 + tau * rho**2)) ** 0.5
 
 
 def from_image_side(x: Tensor, y: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
