@@ -35,6 +35,7 @@ _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
 _TAPS = range(-1, 3)
 _SPHERES = 3  # between which others lie: they rise with the third power of the vergence
+_AT_ONCE = 2**17  # samples of rows, of wavelengths that are transformed together
 _MORE = 1.3  # times the samples that are needed, up to which those of other distances do
 
 
@@ -78,7 +79,7 @@ class LineTransfer:
         if shape[0] > query.shape[0] or shape[1] > query.shape[1]:
             raise ValueError(f"line spreads are of the window {query.shape} that was asked for, not of {shape}.")
         with torch.no_grad(), full_precision(query.device):
-            light = torch.stack([self.spreads.of(query, index) for index in bands]).double()  # (L, 2, Z, length)
+            light = self.spreads.of(query, bands).double()  # (L, 2, Z, length)
             (a, d), length = query.scale, self.spreads.length
             step = query.wavelengths[list(bands)].to(light) * d / (a * query.pixel_pitch)
             step /= self.spreads.spacing * length
@@ -120,35 +121,44 @@ class _Spreads:
         self.known: dict[tuple[int, str], Tensor] = {}  # by wavelength and distance
         self.lit: dict[tuple[str, ...], tuple[list[_Lit], list[_OntoRows]]] = {}  # by distances
 
-    def of(self, query: Query, index: int) -> Tensor:
-        """At each step along x and y from the middle on, then of those before it: (2, Z, length)."""
+    def of(self, query: Query, bands: Sequence[int]) -> Tensor:
+        """At each step along x and y from the middle on, then of those before it: (L, 2, Z, length)."""
         names = [f"{vergence:.12g}" for vergence in query.vergences.tolist()]
-        missing = [place for place, name in enumerate(names) if (index, name) not in self.known]
-        if missing:
-            some = tuple(names[place] for place in missing)
+        missing: dict[tuple[int, ...], list[int]] = {}  # wavelengths, by which of the distances they lack
+        for band in bands:
+            if places := tuple(place for place, name in enumerate(names) if (band, name) not in self.known):
+                missing.setdefault(places, []).append(band)
+        for places, lacking in missing.items():
+            some = tuple(names[place] for place in places)
             if some not in self.lit:
-                own = replace(query, points=Points(query.vergences[missing]))
+                own = replace(query, points=Points(query.vergences[list(places)]))
                 edges = None if self.maps is None else self.maps.edges
                 onto = [] if edges is None else [_OntoRows.of(own, *axis, edges) for axis in enumerate(self.rows)]
                 self.lit[some] = [rows.at(own) for rows in self.pupils], onto
-            found = self._spread(float(query.wavelengths[index]), index, *self.lit[some])
-            self.known.update(zip(((index, name) for name in some), found.unbind(1), strict=True))
-        return torch.stack([self.known[index, name] for name in names], dim=1)
+            step = max(1, _AT_ONCE // (len(some) * self.length * max(map(len, self.rows))))
+            for part in (lacking[start : start + step] for start in range(0, len(lacking), step)):
+                found = self._spread(query.wavelengths[part], part, *self.lit[some])
+                self.known.update(
+                    ((band, name), light)
+                    for band, lights in zip(part, found, strict=True)
+                    for name, light in zip(some, lights.unbind(1), strict=True)
+                )
+        return torch.stack([torch.stack([self.known[band, name] for name in names], dim=1) for band in bands])
 
-    def _spread(self, wavelength: float, index: int, lit: list[_Lit], onto: list[_OntoRows]) -> Tensor:
-        wavenumber = 2 * math.pi / wavelength
-        fields = (None, None) if self.maps is None else self.maps.fields(index, onto)
+    def _spread(self, wavelengths: Tensor, bands: list[int], lit: list[_Lit], onto: list[_OntoRows]) -> Tensor:
+        wavenumbers = (2 * math.pi / wavelengths)[:, None, None]
+        fields = (None, None) if self.maps is None else self.maps.fields(bands, onto)
         spreads = []
         for rows, field in zip(lit, fields, strict=True):
-            phase = (wavenumber * rows.coefficients[index]).to(rows.maps) @ rows.maps.flatten(1)
-            cosine, sine = sines(phase.view(-1, *rows.maps.shape[1:]))
-            amplitude = rows.amplitude_inside(index)
+            phase = (wavenumbers * rows.coefficients[bands]).to(rows.maps) @ rows.maps.flatten(1)
+            cosine, sine = sines(phase.unflatten(-1, rows.maps.shape[1:]))
+            amplitude = rows.amplitude_inside(bands)
             pupil = torch.complex(cosine * amplitude, sine * amplitude)
             transformed = torch.fft.fft(pupil if field is None else pupil * field, n=self.length)
             power = torch.view_as_real(transformed).square_()
             light = power.sum(-3).sum(-1)  # of both at once, or in float64, it takes ten times as long
             spreads.append(light / (self.length * rows.energy[:, None]))
-        return torch.stack(spreads)
+        return torch.stack(spreads, dim=1)
 
 
 def _rows(query: Query, axis: int, samples: int) -> Tensor:
@@ -186,7 +196,8 @@ class _Maps:
         cells, _ = cell_edges(maps := sizes(query, found), math.inf)
         edges = torch.as_tensor(cells)
         amplitude = torch.ones(len(cells) - 1, len(cells) - 1, dtype=query.dtype, device=query.device)
-        phases, factors = [torch.zeros_like(amplitude)], [torch.ones(len(query.wavelengths)).to(amplitude)]
+        phases: list[Tensor] = []
+        factors: list[Tensor] = []
         for pixels, (size, width) in zip(found, maps, strict=True):
             values = looked_up(pixels.values.detach().to(amplitude), cells, size=size, half_width=width)
             if pixels.factors is None:
@@ -195,16 +206,18 @@ class _Maps:
                 phases.append(values)
                 factors.append(pixels.factors.detach().to(amplitude))
         onto_nodes = pixel_weights(edges, nodes.cpu(), spacing=float(nodes[1] - nodes[0])).to(amplitude)
+        if not phases:
+            phases, factors = [torch.zeros_like(amplitude)], [torch.zeros(len(query.wavelengths)).to(amplitude)]
         return _Maps(edges.to(query.device), torch.stack(phases), torch.stack(factors), amplitude, onto_nodes)
 
-    def fields(self, index: int, onto_rows: Sequence[_OntoRows]) -> list[Tensor]:
-        """What the maps do to the light of a wavelength in the rows along x, and in the columns along y, (Z, R, N)."""
-        cosine, sine = sines(torch.einsum("e,eyx->yx", self.factors[:, index], self.phases))
-        re, im = cosine * self.amplitude, sine * self.amplitude
-        found = []
-        for (own_re, own_im), (x, y) in zip((onto(index) for onto in onto_rows), ((re, im), (re.T, im.T)), strict=True):
-            some = torch.stack([own_re @ x - own_im @ y, own_re @ y + own_im @ x])
-            found.append(torch.complex(*(some @ self.onto_nodes.T)))
+    def fields(self, bands: list[int], onto_rows: Sequence[_OntoRows]) -> list[Tensor]:
+        """What the maps do to the light of wavelengths in the rows along x, and in the columns along y, (L, Z, R, N)."""
+        cosine, sine = sines(torch.einsum("el,eyx->lyx", self.factors[:, bands], self.phases))
+        field, found = torch.complex(cosine * self.amplitude, sine * self.amplitude), []
+        for onto, turned in zip(onto_rows, (field, field.mT), strict=True):
+            taken = onto(bands)
+            some = (taken.flatten(1, 2) @ turned).view(taken.shape)
+            found.append(torch.complex(*(torch.stack([some.real, some.imag]) @ self.onto_nodes.T)))
         return found
 
     def power(self, rows: Tensor, nodes: Tensor, axis: int) -> Tensor:
@@ -277,14 +290,14 @@ class _Lit:
     energy: Tensor
     slopes: Tensor | None
 
-    def amplitude_inside(self, index: int) -> Tensor:
-        """Of the light whose rays fall into the window, (1 or Z, R, N)."""
+    def amplitude_inside(self, bands: list[int]) -> Tensor:
+        """Of the light whose rays fall into the window, (L, Z, R, N), or of all, (1 or Z, R, N)."""
         if self.slopes is None:
             return self.amplitude
         a, d = self.query.scale
-        fall = (d / (a * self.query.pixel_pitch) * self.coefficients[index]).to(self.slopes) @ self.slopes.flatten(1)
+        fall = (d / (a * self.query.pixel_pitch) * self.coefficients[bands]).to(self.slopes) @ self.slopes.flatten(1)
         inside = (self.half - fall.abs()) / _SOFT + 0.5
-        return self.amplitude * inside.clamp(0, 1).view(-1, *self.slopes.shape[1:])
+        return self.amplitude * inside.clamp(0, 1).unflatten(-1, self.slopes.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -292,13 +305,12 @@ class _OntoRows:
     """What each row takes of each cell across the rows, of what the smooth phase on its way sends into the window: a
     low-pass of cells that turn as that phase does in the middle of the pupil.
 
-    fringes: see `_fringes`. parts: of each cell. offset: from each row to each part of each cell (R, P C), and how wide
-    that is (P C,), in semi-apertures. coefficients, maps: see `residual_path`; of the parts, (T, P C).
+    fringes: see `_fringes`. offset: from each row to the middles of P parts of each cell (R, P, C), and how wide these
+    are (C,), in semi-apertures. coefficients, maps: see `residual_path`; at places in each part (T, P, Q, C).
     """
 
     query: Query
     fringes: float
-    parts: int
     offset: Tensor
     widths: Tensor
     coefficients: Tensor
@@ -306,30 +318,34 @@ class _OntoRows:
 
     @staticmethod
     def of(query: Query, axis: int, rows: Tensor, edges: Tensor) -> _OntoRows:
-        (a, d), finest, fringes = query.scale, float(query.wavelengths.min()), _fringes(query, axis)
-        sides = edges.diff()
-        cycles = (a * float(query.displacement.max()) / d + fringes / 2) / finest
-        parts = math.ceil(_PER_CYCLE * cycles * float(sides.max()))
-        shares = (torch.arange(parts, dtype=torch.float64, device=rows.device) + 0.5) / parts
-        places = (edges[:-1] + sides * shares[:, None]).flatten()
-        coefficients, maps = residual_path(query, _pupil(query, torch.zeros_like(places), places, axis))
-        offset, widths = places - rows[:, None], (sides / parts).repeat(parts)
-        return _OntoRows(query, fringes, parts, offset.to(query.dtype), widths.to(query.dtype), coefficients, maps)
+        (a, d), fringes = query.scale, _fringes(query, axis)
+        cell = _PER_CYCLE * float(edges.diff().max()) / float(query.wavelengths.min())
+        parts = math.ceil(cell * fringes / 2)  # the low-pass is even in each of them, and the phase at more places
+        places = math.ceil(cell * (fringes / 2 + a * float(query.displacement.max()) / d) / parts)
+        finer = _middles(edges, parts * places).flatten()
+        coefficients, maps = residual_path(query, _pupil(query, torch.zeros_like(finer), finer, axis))
+        offset, widths = _middles(edges, parts) - rows[:, None, None], edges.diff() / parts
+        maps = maps.view(len(maps), parts, places, -1)
+        return _OntoRows(query, fringes, offset.to(query.dtype), widths.to(query.dtype), coefficients, maps)
 
-    def __call__(self, index: int) -> Pair:
-        """Real and imaginary part for a wavelength, (Z, R, C): but for the phase of each row, which no power has."""
-        wavelength = float(self.query.wavelengths[index])
-        density = self.fringes / wavelength
+    def __call__(self, bands: list[int]) -> Tensor:
+        """Of wavelengths, (L, Z, R, C): but for the phase of each row, which no power has."""
+        numbers = 1 / self.query.wavelengths[bands].to(self.offset.device)[:, None, None]
+        density = (self.fringes * numbers).to(self.offset)[..., None]
         offset = self.offset * density  # in samples at the Nyquist frequency of the window's edge
         turned = (offset.abs() * math.pi).clamp_(min=1e-4)  # torch.sinc takes five times as long
         weights = turned.sin() / turned
         weights *= (offset.clamp(-_PASSED, _PASSED) * (math.pi / (2 * _PASSED))).cos_().square_()
         weights *= density * self.widths
-        phase = 2 * math.pi / wavelength * (self.coefficients[index] @ self.maps)
-        re, im = (
-            (weights * part[:, None].to(weights)).unflatten(-1, (self.parts, -1)).sum(-2) for part in sines(phase)
-        )
-        return re, im
+        phase = 2 * math.pi * numbers * (self.coefficients[bands] @ self.maps.flatten(1))
+        parts = (part.unflatten(-1, self.maps.shape[1:]).mean(-2).to(weights) for part in sines(phase))
+        return torch.complex(*((weights[:, None] * part[:, :, None]).sum(-2) for part in parts))
+
+
+def _middles(edges: Tensor, parts: int) -> Tensor:
+    """Of parts of each cell (P, C)."""
+    shares = (torch.arange(parts, dtype=edges.dtype, device=edges.device) + 0.5) / parts
+    return edges[:-1] + edges.diff() * shares[:, None]
 
 
 def _pupil(query: Query, along: Tensor, across: Tensor, axis: int) -> Pupil:
