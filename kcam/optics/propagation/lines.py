@@ -9,6 +9,7 @@ window is left out of each row: rays of a smooth pupil that land there; of a map
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -70,6 +71,9 @@ class LineTransfer:
         )
         fits = like is not None and count <= like.spreads.count <= _MORE * count
         self.spreads: _Spreads = like.spreads if like is not None and fits else _Spreads(query, count)
+        cutoff = 2 * a * query.pixel_pitch / (d * finest)
+        active = query.grid.active if query.grid.integrate else 0.0
+        self._folded = functools.lru_cache(1)(functools.partial(sampling.folded, cutoff=cutoff, active=active))
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
         """As `row.Transfer`, (Z, L, 2, F) complex128; of a smaller window than the query's own roughly: as if the light
@@ -92,9 +96,7 @@ class LineTransfer:
             light *= cut
             near, far = light.tensor_split([(length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
-            cutoff = 2 * a * query.pixel_pitch / (d * float(query.wavelengths.min()))
-            active = query.grid.active if query.grid.integrate else 0.0
-            into, asked, weights = sampling.folded(frequencies.to(light), cutoff, active)
+            into, asked, weights = self._folded(frequencies.to(light))
             found = _between(table, asked * (2 * length * step)[:, None]) * weights
             total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, into, found)
             return total.permute(2, 0, 1, 3)
@@ -216,9 +218,14 @@ class _Maps:
         field, found = torch.complex(cosine * self.amplitude, sine * self.amplitude), []
         for onto, turned in zip(onto_rows, (field, field.mT), strict=True):
             taken = onto(bands)
-            some = (taken.flatten(1, 2) @ turned).view(taken.shape)
-            found.append(torch.complex(*(torch.stack([some.real, some.imag]) @ self.onto_nodes.T)))
+            rows, (nodes, cells) = taken.flatten(1, 2), self.onto_nodes.shape
+            across_first = rows.shape[1] * (4 * cells + 2 * nodes) < 2 * nodes * (cells + 2 * rows.shape[1])
+            some = self._onto_nodes(rows @ turned) if across_first else rows @ self._onto_nodes(turned)
+            found.append(some.unflatten(1, taken.shape[1:3]))
         return found
+
+    def _onto_nodes(self, light: Tensor) -> Tensor:
+        return torch.complex(*(torch.stack([light.real, light.imag]) @ self.onto_nodes.T))
 
     def power(self, rows: Tensor, nodes: Tensor, axis: int) -> Tensor:
         """What passes of the power in the rows along x, or the columns along y, (R, N)."""
