@@ -64,8 +64,9 @@ class Ladder:
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
-    tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; urgency:
-    how much more its error counts than others' where the next ladder to climb is chosen.
+    tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; takes:
+    seconds for it, None for those of the PSFs of its foot and its top; urgency: how much more its error counts than
+    others' where the next ladder to climb is chosen.
     """
 
     effect: str
@@ -88,6 +89,7 @@ class Ladder:
     small: float = SMALL
     doubtful: bool = False
     tried: bool = False
+    takes: float | None = None
     urgency: float = 1.0
     most: float = math.inf
     position: int = 0

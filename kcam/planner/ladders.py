@@ -54,6 +54,9 @@ the largest windows of 61 random pairs they were 0.52 to 3.1 times the others, o
 0.37 to 3.7 times, and of models of 143 maps 0.5 to 2.1 times, 0.8 to 1.55 times of all but 8.
 """
 
+TAKES = 1.2e-2
+"""Seconds for what line spreads tell of models, of the rates' machine."""
+
 BEYOND, SMALL_BEYOND = 4.0, 0.2
 """What pictures of the paraxial model err at most, times (a / d)^2 and a tenth of the RMS that it leaves out of the
 phase [rad]: 0.03 to 1.5 times these of 107 maps of pixels, and 2.8 and 3.8 times of two; more where a few lights stand
@@ -212,13 +215,13 @@ def _blur(view: _View) -> Iterator[Ladder]:
 
 
 def _model(view: _View) -> Iterator[Ladder]:
-    """Paraxial only where that is cheaper: a map of pixels needs no warp then. A single picture saves too little."""
-    if not view.stand_in or view.one:
+    """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
+    if not view.stand_in or (view.one and not view.evaluator.certain):
         return
     beside = {name: value for name, value in view.few().items() if name not in PARAXIAL}
     ladder = Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside, doubtful=True, tried=True)
     if view.evaluator.certain:
-        ladder.off_by, ladder.little = BY_ONE_MODEL, math.inf
+        ladder.off_by, ladder.little, ladder.takes = BY_ONE_MODEL, math.inf, TAKES
         if view.query is not None and not view.evaluator.few_lights:
             tau = float(view.query.tau.detach())
             ladder.bounds, ladder.small = {0: BEYOND * (tau + view.evaluator.left_out / 10)}, SMALL_BEYOND

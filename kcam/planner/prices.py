@@ -100,4 +100,5 @@ class Prices:
         saved = now - self.of({**changes, **foot})[0]
         if not self.one:
             return saved > SAVED * now
-        return saved > (1 - GAIN) * now and saved > self.of(beside)[0] + self.of({**beside, **foot})[0]
+        takes = self.of(beside)[0] + self.of({**beside, **foot})[0] if ladder.takes is None else ladder.takes
+        return saved > (1 - GAIN) * now and saved > takes

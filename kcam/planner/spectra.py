@@ -46,6 +46,9 @@ WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 """Of these, those whose error is that of the PSFs themselves, not of what they are computed for."""
 
 WINDOW = {"psf_shape", "renormalise"}
+"""Of those, those of the window alone."""
+
+BY_LINES = WINDOW | {"propagator"}
 """Of those, those that line spreads tell roughly."""
 
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
@@ -290,7 +293,7 @@ class Spectra:
         self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        if _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - WINDOW):
+        if _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - BY_LINES):
             way = Way.PSFS
         elif care is Care.AT_FIRST:
             way = Way.WHOLE_LINES
@@ -312,6 +315,9 @@ class Spectra:
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, against, way) for own in (against, changes))
             found[0, rows], found[1, rows] = self._energy(ours - theirs, layered), self._all_of_it(index, against, way)
+            if way is Way.LINES and _differ(changes, against, {"propagator"}):
+                least = self.optics.untold(self.optics.stage(against), layered.vergences, self.wavelengths)
+                found[0, rows] = found[0, rows].maximum(least**2 * found[1, rows])
             if len(layered.vergences) > 1 and self._hides:
                 replaced = torch.where(self.few_lights & colours, _HIDDEN_LIGHTS, self._replaced)
                 found[0, rows] *= replaced[rows] ** 2

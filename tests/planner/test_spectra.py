@@ -72,7 +72,7 @@ def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
             ratio = evaluator.error(ours, theirs) / max(trial, 1e-30)
             if 1e-3 < trial < 1:
                 points = "points" in text
-                of_flat = (0.6, 3.0) if not fits else (0.6, 2.5) if points else (0.7, 1.4)
+                of_flat = (0.6, 3.0) if not fits else (0.6, 2.5) if points else (0.7, 1.5)
                 low, high = of_flat if flat else (0.6, through * (4.0 if fits else 8.0 if points else 5.0))
                 if few and ours.get("layers", 1) > 1 and ours["layers"] != theirs["layers"]:
                     high *= 7

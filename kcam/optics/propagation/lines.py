@@ -5,6 +5,9 @@
 So the line spread along x takes one transform along each of a few rows of the pupil, and that along y of a few columns.
 Where a pupil is smooth the rows are a quadrature; of a map of pixels they are a sample. What falls above or below the
 window is left out of each row: rays of a smooth pupil that land there; of a map, what a low-pass along v stops.
+
+Beyond the paraxial model the pixels of a map are curved in the plane of these rows, v' ~ v'_0 (1 - tau u^2 / 2) where
+v'_0 is at u = 0: the light lies, as u^2, between that of two maps whose pixels are straight.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from kcam.optics.numerics import Pair, fast_length, lagrange, lagrange_weights, sines
+from kcam.optics.numerics import fast_length, lagrange, lagrange_weights, sines
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.cells import cell_edges, looked_up, sizes
 from kcam.optics.propagation.question import Query, residual_amplitude, residual_path
@@ -31,6 +34,7 @@ _KAPPA = 1.5  # samples along a row for each fringe that reaches the window
 _ROWS = 32  # of a smooth pupil at least, and one for so many samples along it: errors are 0.99 to 1.2 times what three
 _PER_ROW = 8  # times as many rows tell (5 to 95 % of 414 choices before 69 pupils)
 _SAMPLED = 32  # rows of a map of pixels at least, fewer than twice as many
+_FAR = 2 / 3  # of the semi-aperture, squared: there pixels are displaced most
 _PASSED = 12  # half width of the low-pass along v, in samples at its Nyquist
 _PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
@@ -41,12 +45,12 @@ _MORE = 1.3  # times the samples that are needed, up to which those of other dis
 
 
 def lines(query: Query, like: LineTransfer | None = None) -> LineTransfer | None:
-    """About the transfer functions of a query; None off the axis, and beyond the paraxial model of maps of pixels.
+    """About the transfer functions of a query; None off the axis.
 
     like: those of the same question about other distances, from which it takes what is the same.
     """
-    if query.points.positions is not None or (query.has_pixels and not query.paraxial):
-        return None  # rows of pixels are curved in the image-side plane
+    if query.points.positions is not None:
+        return None
     with torch.no_grad():
         return LineTransfer(query, like)
 
@@ -60,13 +64,15 @@ class LineTransfer:
 
     def __init__(self, query: Query, like: LineTransfer | None = None) -> None:
         self.query = query = replace(query, grid=replace(query.grid, dtype=torch.float32))
+        # under maps as many as in the paraxial model: what these sample is not to differ between the models
+        sampled = query.modelled(paraxial=True) if query.has_pixels else query
         finest, (a, d) = float(query.wavelengths.min()), query.scale
         count = sampling.pupil_samples(
-            semi_aperture=a,
+            semi_aperture=sampled.scale[0],
             sensor_distance=d,
             wavelength=finest,
             half_window=query.half_window,
-            displacement=float(query.displacement.max()),
+            displacement=float(sampled.displacement.max()),
             kappa=_KAPPA,
         )
         fits = like is not None and count <= like.spreads.count <= _MORE * count
@@ -149,7 +155,7 @@ class _Spreads:
 
     def _spread(self, wavelengths: Tensor, bands: list[int], lit: list[_Lit], onto: list[_OntoRows]) -> Tensor:
         wavenumbers = (2 * math.pi / wavelengths)[:, None, None]
-        fields = (None, None) if self.maps is None else self.maps.fields(bands, onto)
+        fields = (None, None) if self.maps is None else self.maps.fields(bands, self.rows, onto)
         spreads = []
         for rows, field in zip(lit, fields, strict=True):
             phase = (wavenumbers * rows.coefficients[bands]).to(rows.maps) @ rows.maps.flatten(1)
@@ -167,7 +173,8 @@ def _rows(query: Query, axis: int, samples: int) -> Tensor:
     """Where rows along x (axis 0), or columns along y (axis 1), cross the pupil, (R,) in semi-apertures."""
     count, every = max(_ROWS, 2 * math.ceil(samples / (2 * _PER_ROW))), 1
     if query.has_pixels:  # as many as tell what falls into the window, and of these some
-        count = max(_SAMPLED, math.ceil(2 * _fringes(query, axis) / float(query.wavelengths.min())))
+        fringes = _fringes(query.modelled(paraxial=True), axis)
+        count = max(_SAMPLED, math.ceil(2 * fringes / float(query.wavelengths.min())))
         every = count // _SAMPLED
     rows = (torch.arange(count, dtype=torch.float64, device=query.device) + 0.5) * (2 / count) - 1
     return rows[count // 2 :] if query.even and not query.has_pixels else rows[every // 2 :: every]
@@ -183,20 +190,22 @@ def _fringes(query: Query, axis: int) -> float:
 class _Maps:
     """All pixel maps of a lens on common cells; see `cells.Cells`, which cuts them by the rim too.
 
-    edges: (C + 1,). phases: (E, C, C), their factors (E, L). amplitude: (C, C). onto_nodes: (N, C).
+    phases: (E, C, C), their factors (E, L). amplitude: (C, C). edges: of the cells in the image-side plane, (1, C + 1),
+    and onto_nodes: (1, N, C); where cells are curved, those on the axis and at `_FAR` from it, of which others take
+    shares (2, C).
     """
 
-    edges: Tensor
     phases: Tensor
     factors: Tensor
     amplitude: Tensor
+    edges: Tensor
     onto_nodes: Tensor
+    shares: Tensor | None
 
     @staticmethod
     def of(query: Query, nodes: Tensor) -> _Maps:
         found = query.lens.pixel_maps(query.wavelengths.to(query.device))
         cells, _ = cell_edges(maps := sizes(query, found), math.inf)
-        edges = torch.as_tensor(cells)
         amplitude = torch.ones(len(cells) - 1, len(cells) - 1, dtype=query.dtype, device=query.device)
         phases: list[Tensor] = []
         factors: list[Tensor] = []
@@ -207,32 +216,51 @@ class _Maps:
             else:
                 phases.append(values)
                 factors.append(pixels.factors.detach().to(amplitude))
-        onto_nodes = pixel_weights(edges, nodes.cpu(), spacing=float(nodes[1] - nodes[0])).to(amplitude)
         if not phases:
             phases, factors = [torch.zeros_like(amplitude)], [torch.zeros(len(query.wavelengths)).to(amplitude)]
-        return _Maps(edges.to(query.device), torch.stack(phases), torch.stack(factors), amplitude, onto_nodes)
+        true, tau, spacing = torch.as_tensor(cells), float(query.tau), float(nodes[1] - nodes[0])
+        curved = [true * ((1 + tau) / (1 + tau * (true**2 + far))).sqrt() for far in ((0.0, _FAR) if tau else (0.0,))]
+        onto_nodes = torch.stack([pixel_weights(own, nodes.cpu(), spacing=spacing) for own in curved]).to(amplitude)
+        shares, edges = _shares((true[1:] + true[:-1]) / 2).to(amplitude) if tau else None, torch.stack(curved)
+        return _Maps(
+            torch.stack(phases), torch.stack(factors), amplitude, edges.to(query.device), onto_nodes, shares
+        )
 
-    def fields(self, bands: list[int], onto_rows: Sequence[_OntoRows]) -> list[Tensor]:
-        """What the maps do to the light of wavelengths in the rows along x, and in the columns along y, (L, Z, R, N)."""
+    def fields(self, bands: list[int], rows: Sequence[Tensor], onto: Sequence[_OntoRows]) -> list[Tensor]:
+        """What the maps do to the light of wavelengths in rows along x, and in columns along y, (L, Z, R, N)."""
         cosine, sine = sines(torch.einsum("el,eyx->lyx", self.factors[:, bands], self.phases))
         field, found = torch.complex(cosine * self.amplitude, sine * self.amplitude), []
-        for onto, turned in zip(onto_rows, (field, field.mT), strict=True):
-            taken = onto(bands)
-            rows, (nodes, cells) = taken.flatten(1, 2), self.onto_nodes.shape
-            across_first = rows.shape[1] * (4 * cells + 2 * nodes) < 2 * nodes * (cells + 2 * rows.shape[1])
-            some = self._onto_nodes(rows @ turned) if across_first else rows @ self._onto_nodes(turned)
-            found.append(some.unflatten(1, taken.shape[1:3]))
+        nodes, cells = self.onto_nodes.shape[1:]
+        for places, across, turned in zip(rows, onto, (field, field.mT), strict=True):
+            taken = across(bands)
+            shape, light = taken.shape[2:4], taken.flatten(2, 3)
+            if self.shares is not None:
+                some = (light @ (turned[:, None] * self.shares[:, None])).sum(1, keepdim=True)
+                shares = _shares(places).to(self.amplitude).repeat(1, shape[0])[..., None]
+                some = self._onto_nodes(some * shares).sum(1)
+            elif light.shape[2] * (4 * cells + 2 * nodes) < 2 * nodes * (cells + 2 * light.shape[2]):
+                some = self._onto_nodes(light[:, 0] @ turned)
+            else:
+                some = light[:, 0] @ self._onto_nodes(turned)
+            found.append(some.unflatten(1, shape))
         return found
 
     def _onto_nodes(self, light: Tensor) -> Tensor:
-        return torch.complex(*(torch.stack([light.real, light.imag]) @ self.onto_nodes.T))
+        weights = self.onto_nodes if self.shares is not None else self.onto_nodes[0]
+        return torch.complex(*(torch.stack([light.real, light.imag]) @ weights.mT))
 
     def power(self, rows: Tensor, nodes: Tensor, axis: int) -> Tensor:
         """What passes of the power in the rows along x, or the columns along y, (R, N)."""
-        places = (torch.bucketize(x.contiguous(), self.edges) - 1 for x in (rows, nodes))
+        places = (torch.bucketize(x.contiguous(), self.edges[0]) - 1 for x in (rows, nodes))
         row, node = (place.clamp(0, len(self.amplitude) - 1) for place in places)
         passed = (self.amplitude.T if axis else self.amplitude).square()[row][:, node]
         return passed * (nodes.abs() <= 1)  # beyond the maps there is no light
+
+
+def _shares(place: Tensor) -> Tensor:
+    """What light at places gives to what is straight on the axis, and at `_FAR` from it, (2, N)."""
+    far = place.square() / _FAR
+    return torch.stack([1 - far, far])
 
 
 class _Path:
@@ -310,10 +338,11 @@ class _Lit:
 @dataclass(frozen=True)
 class _OntoRows:
     """What each row takes of each cell across the rows, of what the smooth phase on its way sends into the window: a
-    low-pass of cells that turn as that phase does in the middle of the pupil.
+    low-pass of cells that turn as that phase does in the middle of the pupil, and, where cells are curved, at `_FAR`.
 
-    fringes: see `_fringes`. offset: from each row to the middles of P parts of each cell (R, P, C), and how wide these
-    are (C,), in semi-apertures. coefficients, maps: see `residual_path`; at places in each part (T, P, Q, C).
+    fringes: see `_fringes`. offset: from each row to the middles of P parts of each cell (K, R, P, C), and how wide
+    these are (K, C), in semi-apertures. coefficients, maps: see `residual_path`; at places in each part
+    (T, K, P, Q, C), and in the rows, (T, K, R).
     """
 
     query: Query
@@ -322,6 +351,7 @@ class _OntoRows:
     widths: Tensor
     coefficients: Tensor
     maps: Tensor
+    in_rows: Tensor
 
     @staticmethod
     def of(query: Query, axis: int, rows: Tensor, edges: Tensor) -> _OntoRows:
@@ -329,30 +359,52 @@ class _OntoRows:
         cell = _PER_CYCLE * float(edges.diff().max()) / float(query.wavelengths.min())
         parts = math.ceil(cell * fringes / 2)  # the low-pass is even in each of them, and the phase at more places
         places = math.ceil(cell * (fringes / 2 + a * float(query.displacement.max()) / d) / parts)
-        finer = _middles(edges, parts * places).flatten()
-        coefficients, maps = residual_path(query, _pupil(query, torch.zeros_like(finer), finer, axis))
-        offset, widths = _middles(edges, parts) - rows[:, None, None], edges.diff() / parts
-        maps = maps.view(len(maps), parts, places, -1)
-        return _OntoRows(query, fringes, offset.to(query.dtype), widths.to(query.dtype), coefficients, maps)
+        finer = torch.cat([_middles(edges, parts * places).flatten(1), rows.expand(len(edges), -1)], dim=1)
+        coefficients, found = _across(query, axis, finer)
+        maps, in_rows = found.tensor_split([found.shape[-1] - len(rows)], dim=-1)
+        offset, widths = _middles(edges, parts)[:, None] - rows[:, None, None], edges.diff() / parts
+        maps, dtype = maps.unflatten(-1, (parts, places, -1)), query.dtype
+        return _OntoRows(query, fringes, offset.to(dtype), widths.to(dtype), coefficients, maps, in_rows)
 
     def __call__(self, bands: list[int]) -> Tensor:
-        """Of wavelengths, (L, Z, R, C): but for the phase of each row, which no power has."""
+        """Of wavelengths, (L, K, Z, R, C): but for a phase of each row, which no power has."""
         numbers = 1 / self.query.wavelengths[bands].to(self.offset.device)[:, None, None]
-        density = (self.fringes * numbers).to(self.offset)[..., None]
+        density = (self.fringes * numbers).to(self.offset)[..., None, None]
         offset = self.offset * density  # in samples at the Nyquist frequency of the window's edge
         turned = (offset.abs() * math.pi).clamp_(min=1e-4)  # torch.sinc takes five times as long
         weights = turned.sin() / turned
         weights *= (offset.clamp(-_PASSED, _PASSED) * (math.pi / (2 * _PASSED))).cos_().square_()
-        weights *= density * self.widths
-        phase = 2 * math.pi * numbers * (self.coefficients[bands] @ self.maps.flatten(1))
-        parts = (part.unflatten(-1, self.maps.shape[1:]).mean(-2).to(weights) for part in sines(phase))
-        return torch.complex(*((weights[:, None] * part[:, :, None]).sum(-2) for part in parts))
+        weights *= density * self.widths[:, None, None]
+        phase = 2 * math.pi * numbers * self.coefficients[bands]
+        parts = (part.mean(-2).to(weights) for part in sines(_at(phase, self.maps)))
+        taken = torch.complex(*((weights[:, :, None] * part[:, :, :, None]).sum(-2) for part in parts))
+        if len(self.widths) == 1:
+            return taken
+        back = torch.complex(*(part.to(weights) for part in sines(_at(-phase, self.in_rows))))
+        return taken * back[..., None]
+
+
+def _at(phase: Tensor, maps: Tensor) -> Tensor:
+    """Sums (L, K, Z, ...) of maps (T, K, ...) with factors (L, Z, T)."""
+    return (phase @ maps.flatten(1)).unflatten(-1, maps.shape[1:]).transpose(1, 2)
+
+
+def _across(query: Query, axis: int, places: Tensor) -> tuple[Tensor, Tensor]:
+    """As `residual_path`, at places across the rows (K, N): that of the paraxial model in the middle of the pupil, and
+    what the exact one has beyond it there, and at `_FAR`.
+    """
+    flat, along = query.modelled(paraxial=True), places.new_tensor([[0.0], [math.sqrt(_FAR)]])[: len(places)]
+    middle, maps = residual_path(flat, _pupil(flat, 0 * along, places, axis))
+    if query.paraxial:
+        return middle, maps
+    exact, paraxial = (residual_path(model, _pupil(model, along, places, axis)) for model in (query, flat))
+    return torch.cat([middle, exact[0], -paraxial[0]], dim=-1), torch.cat([maps, exact[1], paraxial[1]])
 
 
 def _middles(edges: Tensor, parts: int) -> Tensor:
-    """Of parts of each cell (P, C)."""
+    """Of parts of each cell (K, P, C)."""
     shares = (torch.arange(parts, dtype=edges.dtype, device=edges.device) + 0.5) / parts
-    return edges[:-1] + edges.diff() * shares[:, None]
+    return edges[:, None, :-1] + edges.diff()[:, None] * shares[:, None]
 
 
 def _pupil(query: Query, along: Tensor, across: Tensor, axis: int) -> Pupil:
