@@ -53,7 +53,8 @@ class Ladder:
     alternatives: for each rung, other changes of the same cost, of which the one with the smallest error is taken.
     follows: a ladder on whose rung the errors depend, such as that of occlusion on the number of layers; settled: the
     fineness of its rungs beyond which they do not.
-    off_by: how many times too large or too small a rough estimate may be; 1 where there is none. little: see `LITTLE`.
+    off_by: how many times too large or too small a rough estimate may be; 1 where there is none. rough: the care of
+    those; little: see `LITTLE`, infinite where they are enough.
     from_top: whether rungs are looked at from the top down, to the last that may do alone; where there is a rough
     estimate, that is asked first, the others are priced at one wavelength, and it says what more of them add. fastest:
     with which power of its step its error falls at most, so that rungs which cannot do are not looked at; None where
@@ -65,8 +66,9 @@ class Ladder:
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; takes:
-    seconds for it, None for those of the PSFs of its foot and its top; urgency: how much more its error counts than
-    others' where the next ladder to climb is chosen.
+    seconds for it, None for those of the PSFs of its foot and its top; foreseen: an error that its foot hardly is below,
+    by which it is then left alone; urgency: how much more its error counts than others' where the next ladder to climb
+    is chosen.
     """
 
     effect: str
@@ -78,6 +80,7 @@ class Ladder:
     follows: Ladder | None = None
     settled: float = math.inf
     off_by: float = 1.0
+    rough: Care = Care.ROUGH
     little: float = LITTLE
     orders: tuple[float, float] = ORDERS
     from_top: bool = False
@@ -90,6 +93,7 @@ class Ladder:
     doubtful: bool = False
     tried: bool = False
     takes: float | None = None
+    foreseen: float = 0.0
     urgency: float = 1.0
     most: float = math.inf
     position: int = 0
@@ -120,7 +124,7 @@ class Ladder:
         if position == len(self.levels) - 1:
             return 0.0
         known = self.errors if key in self.errors else self.grey
-        error = max(known[key], self.least) if key in known else self.off_by * self.roughly[Care.ROUGH][key]
+        error = max(known[key], self.least) if key in known else self.off_by * self.roughly[self.rough][key]
         return math.hypot(error, self.seams(self.levels[position])) if self.seams and self.most < FINE else error
 
     def _key(self, position: int) -> tuple[int, int]:
@@ -154,7 +158,7 @@ class Ladder:
     def _lowest(self, evaluator: Evaluator, most: float) -> int:
         """The lowest rung whose error may do alone, as may those of all above it."""
         low = len(self.levels) - 1
-        if low > 0 and self.off_by > 1 and self._roughly(evaluator, low - 1, Care.AT_FIRST) > self.off_by * most:
+        if low > 0 and self._by_one and self._roughly(evaluator, low - 1, Care.AT_FIRST) > self.off_by * most:
             return low
         while low > 0:
             self._price(evaluator, low - 1, most)
@@ -173,13 +177,18 @@ class Ladder:
             self.errors[key] = self.bounds[position]
         elif self.successive:
             self.errors[key] = self._beyond(evaluator)
-        elif self.from_top and self.off_by > 1:
+        elif self._by_one:
             if key not in self.grey:
                 self.levels[position], self.grey[key] = self._best(evaluator, position, **GREY)
             if self.grey[key] <= most:
                 self.errors[key] = self._coloured(evaluator, position)
         elif self.off_by == 1 or not self._settled(self._roughly(evaluator, position), most):
             self.levels[position], self.errors[key] = self._best(evaluator, position)
+
+    @property
+    def _by_one(self) -> bool:
+        """Whether rungs are priced at one wavelength, and roughly at more."""
+        return self.from_top and self.off_by > 1 and math.isfinite(self.little)
 
     def _coloured(self, evaluator: Evaluator, position: int) -> float:
         """The error of a rung by what it is at one wavelength, and how much more it is at a few, roughly. Where that is
@@ -203,10 +212,12 @@ class Ladder:
         best = min(range(len(errors)), key=errors.__getitem__)
         return candidates[best], max(errors[best], self.least)
 
-    def _roughly(self, evaluator: Evaluator, position: int, care: Care = Care.ROUGH) -> float:
-        key, known = self._key(position), self.roughly[care]
+    def _roughly(self, evaluator: Evaluator, position: int, care: Care | None = None) -> float:
+        key, known = self._key(position), self.roughly[care or self.rough]
         if key not in known:
-            known[key] = self._best(evaluator, position, care)[1]
+            best, known[key] = self._best(evaluator, position, care or self.rough)
+            if not math.isfinite(self.little):
+                self.levels[position] = best
         return known[key]
 
     def _settled(self, roughly: float, most: float) -> bool:

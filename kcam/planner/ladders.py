@@ -22,6 +22,7 @@ from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.planner.ladder import Ladder, Level
+from kcam.planner.spectra import Care
 from kcam.planner.survey import RANKS
 from kcam.scene import Scene
 
@@ -47,15 +48,23 @@ FEW_DISTANCES = 33
 HIDING = 9
 """Layers of depth with which what hides what costs what it does with more: 0.93 to 1.07 times, measured."""
 
-BY_LINES, BY_ONE, BY_ONE_MODEL = 4.0, 4.0, 1.25
+BY_LINES, BY_ONE = 4.0, 4.0
 """How many times too large or too small rough errors may be: of the PSF's window by line spreads instead of PSFs, which
-only refuse, of pupil samples at one wavelength instead of a few, and of the paraxial model, of which that is enough. Of
-the largest windows of 61 random pairs they were 0.52 to 3.1 times the others, of 150, where they were above `COARSE`,
-0.37 to 3.7 times, and of models of 143 maps 0.5 to 2.1 times, 0.8 to 1.55 times of all but 8.
+only refuse, and of pupil samples at one wavelength instead of a few. Of the largest windows of 61 random pairs they
+were 0.52 to 3.1 times the others, of 150, where they were above `COARSE`, 0.37 to 3.7 times.
+"""
+
+BY_LINES_OF_PIXELS, BY_ONE_MODEL = 1.2, 1.25
+"""The same of what line spreads tell of pictures behind maps of pixels well enough: what windows cost, and the paraxial
+model, at one wavelength. Of 114 windows behind 60 maps they were 0.84 to 5.2 times the truth, of models of 104 maps
+0.64 to 6 times, and to 13 of a few lights.
 """
 
 TAKES = 1.2e-2
 """Seconds for what line spreads tell of models, of the rates' machine."""
+
+FORESEEN = {False: 1.5, True: 6.0}
+"""Times (a / d)^2, about what that is told of in the median of 104 maps of pixels: of pictures, and of few lights."""
 
 BEYOND, SMALL_BEYOND = 4.0, 0.2
 """What pictures of the paraxial model err at most, times (a / d)^2 and a tenth of the RMS that it leaves out of the
@@ -222,8 +231,9 @@ def _model(view: _View) -> Iterator[Ladder]:
     ladder = Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside, doubtful=True, tried=True)
     if view.evaluator.certain:
         ladder.off_by, ladder.little, ladder.takes = BY_ONE_MODEL, math.inf, TAKES
-        if view.query is not None and not view.evaluator.few_lights:
-            tau = float(view.query.tau.detach())
+        tau, few = 0.0 if view.query is None else float(view.query.tau.detach()), view.evaluator.few_lights
+        ladder.foreseen = FORESEEN[few] * tau
+        if view.query is not None and not few:
             ladder.bounds, ladder.small = {0: BEYOND * (tau + view.evaluator.left_out / 10)}, SMALL_BEYOND
     yield ladder
 
@@ -336,8 +346,10 @@ def _support(view: _View) -> Iterator[Ladder]:
 
     by_lines = view.evaluator.by_lines(view.beside)
     tabled = not by_lines and view.evaluator.tabled(view.beside)
-    beside = view.few(bands=FEW_BANDS if by_lines else ROUND, layers=FEW_LAYERS, window=False)
-    off_by = BY_LINES if by_lines else 1.0
+    pixels = by_lines and view.query is not None and view.query.has_pixel_phase
+    beside = view.few(
+        bands=FEW_BANDS if by_lines else ROUND, layers=view.few_layers if pixels else FEW_LAYERS, window=False
+    )
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
     core = tabled and view.evaluator.few_lights  # of which little may count that is far, as beyond wrapped profiles
     least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one and not core else 0.0
@@ -349,15 +361,13 @@ def _support(view: _View) -> Iterator[Ladder]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
     levels = [*levels, top]
-    yield Ladder(
-        "PSF support",
-        levels,
-        beside,
-        alternatives=rescaled,
-        off_by=off_by,
-        from_top=view.evaluator.certain,
-        doubtful=view.one and not tabled,  # for what takes PSFs
-    )
+    ladder = Ladder("PSF support", levels, beside, alternatives=rescaled, from_top=view.evaluator.certain)
+    ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
+    if pixels:
+        ladder.off_by, ladder.rough, ladder.little = BY_LINES_OF_PIXELS, Care.AT_FIRST, math.inf
+    elif by_lines:
+        ladder.off_by = BY_LINES
+    yield ladder
 
 
 def _field(view: _View) -> Iterator[Ladder]:

@@ -18,7 +18,7 @@ from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
-from kcam.planner.ladder import Ladder
+from kcam.planner.ladder import LITTLE, Ladder
 from kcam.planner.ladders import ladders
 from kcam.planner.light import FEW, lights
 from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_raw, shortened, together
@@ -229,7 +229,9 @@ class Planner:
         climb()
         for ladder in filter(self._last, steps):
             before, places = _changes(steps), [way.position for way in ways]
-            if ladder.position == 0 or not (ladder.nothing or self.prices.worth(ladder, before)):
+            if ladder.position == 0 or ladder.foreseen > LITTLE * most:
+                continue
+            if not (ladder.nothing or self.prices.worth(ladder, before)):
                 continue
             ladder.position = 0
             climb()
