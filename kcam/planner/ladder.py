@@ -66,9 +66,9 @@ class Ladder:
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; takes:
-    seconds for it, None for those of the PSFs of its foot and its top; foreseen: an error that its foot hardly is below,
-    by which it is then left alone; urgency: how much more its error counts than others' where the next ladder to climb
-    is chosen.
+    seconds for it, None for those of the PSFs of its foot and its top; foreseen: an error that its foot is hardly
+    below, by which it is then left alone; urgency: how much more its error counts than others' where the next ladder
+    to climb is chosen.
     """
 
     effect: str
@@ -305,7 +305,8 @@ class Ladder:
         """The number that decided."""
         if self.position == 0:
             return "" if len(self.levels) == 1 else "the least there is suffices"
-        known = self.roughly[Care.AT_FIRST] | self.roughly[Care.ROUGH] | self.grey | self.errors
+        parts = (*self.roughly.values(), self.grey, self.errors)
+        known = {key: error for part in parts for key, error in part.items()}
         below = max((key for key in known if key[0] < self.position), default=None)
         if below is None:
             return "would save less time than it takes to find out"
