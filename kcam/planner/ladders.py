@@ -62,8 +62,10 @@ model, at one wavelength. Of 114 windows behind 60 maps they were 0.84 to 5.2 ti
 0.64 to 6 times, and to 13 of a few lights.
 """
 
-TAKES = 1.2e-2
-"""Seconds for what line spreads tell of models, of the rates' machine."""
+TAKES, TAKES_RANK = 1.2e-2, (2e-2, 3e-8)
+"""Seconds, on the machine of the rates, for what line spreads tell of models; and for the ranks of a cube, and each of
+its numbers.
+"""
 
 FORESEEN = {False: 1.5, True: 6.0}
 """Times (a / d)^2, about what that is told of in the median of 104 maps of pixels: of pictures, and of few lights."""
@@ -298,7 +300,10 @@ def _rank(view: _View) -> Iterator[Ladder]:
     if view.scene.spectra is None and own > 1:
         levels = [Level(f"rank {rank}", {"rank": rank}, rank) for rank in RANKS if rank < own]
         least = CANCELLED[view.dtype]
-        yield Ladder("spectra", [*levels, Level(f"{own} bands", {}, own)], {"blur": False}, doubtful=True, least=least)
+        levels.append(Level(f"{own} bands", {}, own))
+        ladder = Ladder("spectra", levels, {"blur": False}, doubtful=True, least=least)
+        ladder.takes = TAKES_RANK[0] + TAKES_RANK[1] * view.scene.coefficients.numel()
+        yield ladder
 
 
 def _depth(view: _View) -> Iterator[Ladder]:
