@@ -229,7 +229,7 @@ class Planner:
         climb()
         for ladder in filter(self._last, steps):
             before, places = _changes(steps), [way.position for way in ways]
-            if ladder.position == 0 or ladder.foreseen > LITTLE * most:
+            if ladder.position == 0 or not self._fits(ladder, [way.error for way in ways], most):
                 continue
             if not (ladder.nothing or self.prices.worth(ladder, before)):
                 continue
@@ -239,6 +239,10 @@ class Planner:
                 for way, position in zip(ways, places, strict=True):
                     way.position = position
                 climb()  # finer rungs may have told more of these
+
+    def _fits(self, ladder: Ladder, errors: Sequence[float], most: float) -> bool:
+        """Whether what is foreseen of it leaves others enough; for a single picture what they now take."""
+        return together([*errors, ladder.foreseen]) <= most if self.one else ladder.foreseen <= LITTLE * most
 
     def _last(self, ladder: Ladder) -> bool:
         """Whether it is looked at when the others stand, where it then saves enough."""
