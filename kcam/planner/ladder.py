@@ -66,9 +66,9 @@ class Ladder:
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; takes:
-    seconds for it, None for those of the PSFs of its foot and its top; foreseen: an error that its foot is hardly
-    below, by which it is then left alone; urgency: how much more its error counts than others' where the next ladder
-    to climb is chosen.
+    seconds for it, None for those of the PSFs of its foot and its top; foreseen: about what its foot errs, by which it
+    is then left alone, or 0; urgency: how much more its error counts than others' where the next ladder to climb is
+    chosen.
     """
 
     effect: str

@@ -58,7 +58,7 @@ were 0.52 to 3.1 times the others, of 150, where they were above `COARSE`, 0.37 
 
 BY_LINES_OF_PIXELS, BY_ONE_MODEL = 1.2, 1.25
 """The same of what line spreads tell of pictures behind maps of pixels well enough: what windows cost, and the paraxial
-model, at one wavelength. Of 114 windows behind 60 maps they were 0.84 to 5.2 times the truth, of models of 104 maps
+model, at one wavelength. Of 79 windows behind 60 maps they were 0.88 to 5.2 times the truth, of models of 104 maps
 0.64 to 6 times, and to 13 of a few lights.
 """
 
@@ -68,7 +68,7 @@ its numbers.
 """
 
 FORESEEN = {False: 1.5, True: 6.0}
-"""Times (a / d)^2, about what that is told of in the median of 104 maps of pixels: of pictures, and of few lights."""
+"""Times (a / d)^2, what models are told to cost in the median of 104 maps of pixels: of pictures, and of few lights."""
 
 BEYOND, SMALL_BEYOND = 4.0, 0.2
 """What pictures of the paraxial model err at most, times (a / d)^2 and a tenth of the RMS that it leaves out of the
@@ -234,7 +234,9 @@ def _model(view: _View) -> Iterator[Ladder]:
     beside = {name: value for name, value in view.few().items() if name not in PARAXIAL}
     ladder = Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside, doubtful=True, tried=True)
     if view.evaluator.certain:
-        ladder.off_by, ladder.little, ladder.takes = BY_ONE_MODEL, math.inf, TAKES
+        ladder.off_by, ladder.little = BY_ONE_MODEL, math.inf
+        if view.row is not None and view.row.lines_of is not None and view.imaging.integrate:
+            ladder.takes = TAKES
         tau, few = 0.0 if view.query is None else float(view.query.tau.detach()), view.evaluator.few_lights
         ladder.foreseen = FORESEEN[few] * tau
         if view.query is not None and not few:
@@ -347,8 +349,9 @@ def _seams(view: _View, beside: dict[str, Any]) -> Callable[[Level], float]:
 
     @functools.cache
     def hiding() -> float:
-        few = beside | ({"layers": _hiding(view)} if view.layers > _hiding(view) else {})
-        return view.evaluator.error(few | {"occlusion": False}, few)
+        layers = _hiding(view)
+        few = beside | ({"layers": layers} if view.layers > layers else {})
+        return (BY_FEWER if layers == HIDING else 1.0) * view.evaluator.error(few | {"occlusion": False}, few)
 
     return lambda level: hiding() * max(0.0, 1 / level.fineness - 1 / view.layers) if level.fineness > 1 else 0.0
 
@@ -378,7 +381,8 @@ def _support(view: _View) -> Iterator[Ladder]:
     levels = [*levels, top]
     ladder = Ladder("PSF support", levels, beside, alternatives=rescaled, from_top=view.evaluator.certain)
     ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
-    if pixels:
+    if pixels:  # but for rescaled ones, which were told 0.3 to 1.2 times what they cost
+        ladder.alternatives = None
         ladder.off_by, ladder.rough, ladder.little = BY_LINES_OF_PIXELS, Care.AT_FIRST, math.inf
     elif by_lines:
         ladder.off_by = BY_LINES

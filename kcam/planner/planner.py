@@ -229,7 +229,7 @@ class Planner:
         climb()
         for ladder in filter(self._last, steps):
             before, places = _changes(steps), [way.position for way in ways]
-            if ladder.position == 0 or not self._fits(ladder, [way.error for way in ways], most):
+            if ladder.position == 0 or not self._fits(ladder, steps, counted, most):
                 continue
             if not (ladder.nothing or self.prices.worth(ladder, before)):
                 continue
@@ -240,9 +240,12 @@ class Planner:
                     way.position = position
                 climb()  # finer rungs may have told more of these
 
-    def _fits(self, ladder: Ladder, errors: Sequence[float], most: float) -> bool:
-        """Whether what is foreseen of it leaves others enough; for a single picture what they now take."""
-        return together([*errors, ladder.foreseen]) <= most if self.one else ladder.foreseen <= LITTLE * most
+    def _fits(self, ladder: Ladder, steps: list[Ladder], counted: list[Skip], most: float) -> bool:
+        """Whether what is foreseen, if anything, leaves others enough; for a single picture what they take now."""
+        if not ladder.foreseen or not self.one:
+            return ladder.foreseen <= LITTLE * most
+        others: list[Any] = [way for way in (*_relevant(steps), *counted) if way is not ladder]
+        return together([ladder.foreseen, *(way.error for way in others)]) <= most
 
     def _last(self, ladder: Ladder) -> bool:
         """Whether it is looked at when the others stand, where it then saves enough."""

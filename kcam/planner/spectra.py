@@ -48,8 +48,8 @@ WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 WINDOW = {"psf_shape", "renormalise"}
 """Of those, those of the window alone."""
 
-BY_LINES = WINDOW | {"propagator"}
-"""Of those, those that line spreads tell roughly."""
+TOLD_BY_LINES = WINDOW | {"propagator"}
+"""These and others that line spreads tell roughly."""
 
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
@@ -83,7 +83,7 @@ class Care(enum.Enum):
     """With how much an error is estimated."""
 
     FULL = enum.auto()
-    ROUGH = enum.auto()  # of windows by line spreads, of others at one wavelength
+    ROUGH = enum.auto()  # of windows by line spreads, of models by these at one wavelength, of others at one wavelength
     AT_FIRST = enum.auto()  # of windows by line spreads of the whole, of which a smaller one is a part
 
 
@@ -293,7 +293,7 @@ class Spectra:
         self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        if _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - BY_LINES):
+        if _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES):
             way = Way.PSFS
         elif care is Care.AT_FIRST:
             way = Way.WHOLE_LINES

@@ -40,8 +40,8 @@ _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not
 _BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
 # slices tell of a PSF, and of a map of pixels, of which only some rows are looked at: 0.75 to 1.24 times the truth of
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
-_MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds at least, from which on line spreads tell what models
-# differ in; else it holds more or less of it by this times (a / d)^2: 0.4 to 1.3 times that of 53 maps of pixels
+_MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
+# what models differ in; else it holds more or less by this times (a / d)^2: 0.4 to 1.3 times what 53 maps of pixels do
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -222,6 +222,8 @@ class Transfers:
         query = self._widest
         if query is None or not query.has_pixels:
             return 0.0
+        if imaging.accuracy.renormalise:
+            imaging = imaging.changed(renormalise=False)
         passed = self.of(imaging, vergences, wavelengths, Way.LINES)[0][..., 0].real
         return _DIMMER * float(query.tau.detach()) if float(passed.min()) < _MISSED else 0.0
 

@@ -15,6 +15,7 @@ from kcam import optics
 from kcam.optics.propagation import lines
 from kcam.optics.propagation.grid import MATRIX
 from kcam.optics.propagation.question import Query
+from kcam.optics.propagation.row import Propagator
 from kcam.optics.source import PixelGrid, Points
 from kcam.units import mm, nm, um
 
@@ -167,6 +168,19 @@ def test_in_focus_they_are_the_autocorrelation_of_the_disc() -> None:
     expected = 2 / math.pi * (v.arccos() - v * (1 - v**2).sqrt()) * torch.sinc(FREQUENCIES)
     torch.testing.assert_close(found.real, expected.expand(2, -1), rtol=0, atol=6e-3)  # the window leaves 0.3 % out
     assert found.imag.abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("row", [MATRIX, MATRIX.in_fresnel_range()], ids=lambda row: row.physics)
+def test_they_are_told_on_the_device_of_the_query(row: Propagator, kind: str, device: torch.device) -> None:
+    query = random_question(1, kind)
+    expected = row.lines(query)(FREQUENCIES, query.shape, range(3))
+    grid = dataclasses.replace(query.grid, device=device)
+    there = dataclasses.replace(query, points=Points(query.vergences.to(device)), grid=grid)
+    there.lens.to(device)
+    found = row.lines(there)(FREQUENCIES.to(device), there.shape, range(3))
+    assert found.device.type == device.type
+    torch.testing.assert_close(found.cpu(), expected, rtol=0, atol=1e-5)
 
 
 def test_only_those_are_told_that_can_be() -> None:

@@ -112,6 +112,23 @@ def test_tolerance_zero_is_the_reference_physics() -> None:
     assert plan.bound == 0
 
 
+@pytest.mark.parametrize("one", [False, True])
+@pytest.mark.parametrize("kind", ["map", "depth", "both"])
+def test_choices_that_are_looked_at_last_need_no_others_where_nothing_is_blurred(kind: str, one: bool) -> None:
+    """Beside "no blur" other choices are not priced: those that are looked at last ask nothing of them."""
+    draw = Draw(3)
+    smooth = nn.functional.interpolate(draw.noise(1, 1, 5, 5), size=(48, 48), mode="bicubic")[0, 0]
+    elements = () if kind == "depth" else (optics.DOE(math.pi * smooth),)
+    depth = 1.0 if kind == "map" else ramp(0.9, 1.2)
+    shot, light = camera(*elements, diameter=2 * mm, focus=1.0), scene(depth=depth)
+    shot[0].pixel_pitch = 40 * um
+    planner = Planner(shot, light, one=one)
+    for tolerance in (0.9, 0.3, 0.1, 0.02):
+        plan = planner.plan(tolerance)
+        assert plan.measure(shot, light) <= tolerance
+    assert planner.plan(0.9).changes.get("blur") is False
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_tolerance_holds_for_a_cube_of_full_rank(dtype: torch.dtype) -> None:
     values = torch.rand(1, 10, 40, 40, generator=torch.Generator().manual_seed(0)).to(dtype)

@@ -12,7 +12,6 @@ v'_0 is at u = 0: the light lies, as u^2, between that of two maps whose pixels 
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ _PER_ROW = 8  # times as many rows tell (5 to 95 % of 414 choices before 69 pupi
 _SAMPLED = 32  # rows of a map of pixels at least, fewer than twice as many
 _FAR = 2 / 3  # of the semi-aperture, squared: there pixels are displaced most
 _PASSED = 12  # half width of the low-pass along v, in samples at its Nyquist
-_PER_CYCLE = 4  # parts of a pixel for each cycle of the phase in it
+_PER_CYCLE = 4  # parts of a pixel for each cycle of the low-pass in it, and places for each cycle of the phase
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
 _TAPS = range(-1, 3)
 _SPHERES = 3  # between which others lie: they rise with the third power of the vergence
@@ -77,9 +76,8 @@ class LineTransfer:
         )
         fits = like is not None and count <= like.spreads.count <= _MORE * count
         self.spreads: _Spreads = like.spreads if like is not None and fits else _Spreads(query, count)
-        cutoff = 2 * a * query.pixel_pitch / (d * finest)
-        active = query.grid.active if query.grid.integrate else 0.0
-        self._folded = functools.lru_cache(1)(functools.partial(sampling.folded, cutoff=cutoff, active=active))
+        self._cutoff = 2 * a * query.pixel_pitch / (d * finest)
+        self._folds: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None  # of the frequencies asked for last
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
         """As `row.Transfer`, (Z, L, 2, F) complex128; of a smaller window than the query's own roughly: as if the light
@@ -102,10 +100,18 @@ class LineTransfer:
             light *= cut
             near, far = light.tensor_split([(length + 1) // 2], dim=-1)
             table = torch.fft.rfft(torch.cat([near, near.new_zeros(light.shape), far], dim=-1))  # twice as fine
-            into, asked, weights = self._folded(frequencies.to(light))
+            into, asked, weights = self._folded(frequencies)
             found = _between(table, asked * (2 * length * step)[:, None]) * weights
             total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, into, found)
             return total.permute(2, 0, 1, 3)
+
+    def _folded(self, frequencies: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if self._folds is None or self._folds[0] is not frequencies:
+            grid = self.query.grid
+            active = grid.active if grid.integrate else 0.0
+            found = sampling.folded(frequencies.to(grid.device, torch.float64), self._cutoff, active)
+            self._folds = frequencies, found
+        return self._folds[1]
 
     @staticmethod
     def _inside(shape: tuple[int, int], step: Tensor, x: Tensor) -> Tensor:
@@ -154,7 +160,7 @@ class _Spreads:
         return torch.stack([torch.stack([self.known[band, name] for name in names], dim=1) for band in bands])
 
     def _spread(self, wavelengths: Tensor, bands: list[int], lit: list[_Lit], onto: list[_OntoRows]) -> Tensor:
-        wavenumbers = (2 * math.pi / wavelengths)[:, None, None]
+        wavenumbers = (2 * math.pi / wavelengths).to(lit[0].maps.device)[:, None, None]
         fields = (None, None) if self.maps is None else self.maps.fields(bands, self.rows, onto)
         spreads = []
         for rows, field in zip(lit, fields, strict=True):
