@@ -18,7 +18,7 @@ from kcam.optics import Imaging
 from kcam.optics.imaging import is_deep
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
-from kcam.planner.ladder import LITTLE, Ladder
+from kcam.planner.ladder import Ladder
 from kcam.planner.ladders import ladders
 from kcam.planner.light import FEW, lights
 from kcam.planner.plan import ENDS, SAFETY, UNTRIED, Decision, Plan, noiseless_raw, shortened, together
@@ -241,9 +241,9 @@ class Planner:
                 climb()  # finer rungs may have told more of these
 
     def _fits(self, ladder: Ladder, steps: list[Ladder], counted: list[Skip], most: float) -> bool:
-        """Whether what is foreseen, if anything, leaves others enough; for a single picture what they take now."""
+        """Whether what is foreseen, if anything, may do; for a single picture beside what others take now."""
         if not ladder.foreseen or not self.one:
-            return ladder.foreseen <= LITTLE * most
+            return ladder.foreseen <= most
         others: list[Any] = [way for way in (*_relevant(steps), *counted) if way is not ladder]
         return together([ladder.foreseen, *(way.error for way in others)]) <= most
 

@@ -39,7 +39,7 @@ _PER_CYCLE = 4  # parts of a pixel for each cycle of the low-pass in it, and pla
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
 _TAPS = range(-1, 3)
 _SPHERES = 3  # between which others lie: they rise with the third power of the vergence
-_AT_ONCE = 2**17  # samples of rows, of wavelengths that are transformed together
+_AT_ONCE = 2**17  # samples of rows, of wavelengths that are transformed together: a processor's cache holds no more
 _MORE = 1.3  # times the samples that are needed, up to which those of other distances do
 
 
