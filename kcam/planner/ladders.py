@@ -331,15 +331,17 @@ def _depth(view: _View) -> Iterator[Ladder]:
         tried = any(light >= HARDLY for light in view.evaluator.hidden)
         if view.one and tried:
             levels = levels[1:]  # what would be saved is less than what it takes to find out
-        occlusion = Ladder("occlusion", levels, beside, follows=layers, settled=_hiding(view), tried=tried)
-        if view.evaluator.certain and not view.evaluator.few_lights:
-            occlusion.off_by, occlusion.rough, occlusion.little = BY_FEWER, Care.FULL, math.inf
+        hiding, off_by = _hiding(view)
+        occlusion = Ladder("occlusion", levels, beside, follows=layers, settled=hiding, off_by=off_by, tried=tried)
+        if off_by > 1:
+            occlusion.rough, occlusion.little = Care.FULL, math.inf
         yield occlusion
 
 
-def _hiding(view: _View) -> int:
-    """Layers that tell what hides what."""
-    return HIDING if view.evaluator.certain and not view.evaluator.few_lights else HIDING_LIGHTS
+def _hiding(view: _View) -> tuple[int, float]:
+    """Layers that tell what hides what, and times what they tell there may be."""
+    few = view.evaluator.certain and not view.evaluator.few_lights
+    return (HIDING, BY_FEWER) if few else (HIDING_LIGHTS, 1.0)
 
 
 def _seams(view: _View, beside: dict[str, Any]) -> Callable[[Level], float]:
@@ -349,9 +351,9 @@ def _seams(view: _View, beside: dict[str, Any]) -> Callable[[Level], float]:
 
     @functools.cache
     def hiding() -> float:
-        layers = _hiding(view)
+        layers, factor = _hiding(view)
         few = beside | ({"layers": layers} if view.layers > layers else {})
-        return (BY_FEWER if layers == HIDING else 1.0) * view.evaluator.error(few | {"occlusion": False}, few)
+        return factor * view.evaluator.error(few | {"occlusion": False}, few)
 
     return lambda level: hiding() * max(0.0, 1 / level.fineness - 1 / view.layers) if level.fineness > 1 else 0.0
 
@@ -379,10 +381,10 @@ def _support(view: _View) -> Iterator[Ladder]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
     levels = [*levels, top]
-    ladder = Ladder("PSF support", levels, beside, alternatives=rescaled, from_top=view.evaluator.certain)
+    alternatives = None if pixels else rescaled  # which line spreads told to cost 0.3 to 1.2 times what they do
+    ladder = Ladder("PSF support", levels, beside, alternatives=alternatives, from_top=view.evaluator.certain)
     ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
-    if pixels:  # but for rescaled ones, which were told 0.3 to 1.2 times what they cost
-        ladder.alternatives = None
+    if pixels:
         ladder.off_by, ladder.rough, ladder.little = BY_LINES_OF_PIXELS, Care.AT_FIRST, math.inf
     elif by_lines:
         ladder.off_by = BY_LINES

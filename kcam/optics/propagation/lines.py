@@ -225,7 +225,7 @@ class _Maps:
         if not phases:
             phases, factors = [torch.zeros_like(amplitude)], [torch.zeros(len(query.wavelengths)).to(amplitude)]
         true, tau, spacing = torch.as_tensor(cells), float(query.tau), float(nodes[1] - nodes[0])
-        curved = [true * ((1 + tau) / (1 + tau * (true**2 + far))).sqrt() for far in ((0.0, _FAR) if tau else (0.0,))]
+        curved = [to_image_side(true, tau, aside=far) for far in ((0.0, _FAR) if tau else (0.0,))]
         onto_nodes = torch.stack([pixel_weights(own, nodes.cpu(), spacing=spacing) for own in curved]).to(amplitude)
         shares, edges = _shares((true[1:] + true[:-1]) / 2).to(amplitude) if tau else None, torch.stack(curved)
         return _Maps(

@@ -84,9 +84,11 @@ def grid_spacing(count: int) -> float:
     return 2.0 / (count - 2 * EDGE_MARGIN)
 
 
-def to_image_side(rho: Any, tau: Any) -> Any:
-    """Image-side radius of a true one, a tensor or a number each: rho'^2 = rho^2 (1 + tau) / (1 + tau rho^2)."""
-    return rho * ((1 + tau) / (1 + tau * rho**2)) ** 0.5
+def to_image_side(rho: Any, tau: Any, *, aside: float = 0.0) -> Any:
+    """Image-side radius of a true one, a tensor or a number each: rho'^2 = rho^2 (1 + tau) / (1 + tau rho^2); or x' of
+    x, where y^2 is `aside`.
+    """
+    return rho * ((1 + tau) / (1 + tau * (rho**2 + aside))) ** 0.5
 
 
 def from_image_side(x: Tensor, y: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
