@@ -24,7 +24,7 @@ import contextlib
 import operator
 import types
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextvars import ContextVar
 from dataclasses import is_dataclass
 from typing import Any, TypeVar
@@ -43,7 +43,7 @@ _INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
 T = TypeVar("T")
-_SEEN: ContextVar[dict[tuple[int, str], tuple[Any, Any]] | None] = ContextVar("seen", default=None)
+_SEEN: ContextVar[dict[tuple[int, Hashable], tuple[Any, Any]] | None] = ContextVar("seen", default=None)
 
 
 class Unknown(Exception):
@@ -53,6 +53,9 @@ class Unknown(Exception):
 @contextlib.contextmanager
 def unchanged() -> Iterator[None]:
     """While no module changes: what is `seen` of each is then looked at once, not whenever it is asked."""
+    if torch.compiler.is_compiling():
+        yield
+        return
     token = _SEEN.set(_SEEN.get() or {})
     try:
         yield
@@ -60,7 +63,7 @@ def unchanged() -> Iterator[None]:
         _SEEN.reset(token)
 
 
-def seen(thing: object, what: str, look: Callable[[], T]) -> T:
+def seen(thing: object, what: Hashable, look: Callable[[], T]) -> T:
     """What a look at a thing finds, which is kept while all is `unchanged`."""
     known = _SEEN.get()
     if known is None:

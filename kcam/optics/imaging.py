@@ -15,7 +15,7 @@ from typing import Any, Protocol, Unpack
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, differentiated, has_derivative
+from kcam.cache import ValueCache, differentiated, has_derivative, unchanged
 from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
@@ -173,7 +173,8 @@ class Imaging(Stage):
         else:
             changed = Imaging(**(self.configuration() | arguments))
         shared = ["_traced_cache", "_window_cache", "_reach", "known"]
-        if all(getattr(changed, name) == getattr(self, name) for name in ("bands", "lateral_colour", "blur")):
+        ours, theirs = self.accuracy, changed.accuracy
+        if (ours.bands, ours.lateral_colour, ours.blur) == (theirs.bands, theirs.lateral_colour, theirs.blur):
             shared.append("_field_cache")
         vars(changed).update({name: vars(self)[name] for name in shared})  # past torch's checks, at each step of a plan
         changed._warns = self._warns and "layers" not in arguments
@@ -183,10 +184,11 @@ class Imaging(Stage):
         """The same stage with another accuracy, which has kept nothing."""
         changed = Imaging.__new__(Imaging)
         super(Imaging, changed).__init__()
-        own = {name: value for name, value in vars(self).items() if name not in vars(changed)}
+        own = vars(self) | vars(changed)  # torch's own are new
         own |= {name: ValueCache() for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache")}
-        vars(changed).update(own, _modules=dict(vars(self)["_modules"]))
-        changed.accuracy = accuracy
+        vars(changed).update(own, _modules=dict(vars(self)["_modules"]), accuracy=accuracy)
+        if accuracy.propagator is not self.accuracy.propagator:
+            changed.accuracy = accuracy
         return changed
 
     def fresh(self) -> Imaging:
@@ -242,6 +244,7 @@ class Imaging(Stage):
         """The optics, for exposure in physical units."""
         return {"lens": self.lens, "pixel_pitch": self.pixel_pitch, "fill_factor": self.fill_factor}
 
+    @unchanged()
     def forward(
         self, scene: Scene | Tensor, context: Context | None = None, *, colour_filter: Absorber | None = None
     ) -> Tensor:

@@ -263,7 +263,7 @@ class Lens(ElementStack):
                 "as many as this PSF needs, or use a smaller shape."
             )
         seen(self, "check", self.check)
-        self._check_f_number()
+        seen(self, "f-number", self._check_f_number)
         where = points.positions
         where = None if where is None else where.to(pixels.device, torch.float64)
         points = Points(points.vergences.to(pixels.device, torch.float64), where)
@@ -352,5 +352,5 @@ class Lens(ElementStack):
                 "Rayleigh-Sommerfeld: computed all the same, but with an unknown error. An aperture of "
                 "{:.2g} to {:.2g} mm is within.".format(*limits),
                 UserWarning,
-                stacklevel=3,
+                stacklevel=4,
             )

@@ -34,7 +34,7 @@ class Prices:
         self.evaluator, self.imaging, self.always, self.one = evaluator, evaluator.imaging, always, one
         self.apart = evaluator.apart if evaluator.varies and evaluator.samples and not one else None
         self.rates = costs.current_rates("" if self.imaging is None else self.imaging.accuracy.propagator)
-        self.channels = self._channels(camera, scenes[0])
+        self.channels = self._channels(camera)
         self.kept: dict[tuple[Any, ...], Work] = {}
         self.scene = scenes[0]
         if len(scenes) > 1:
@@ -60,11 +60,8 @@ class Prices:
         return self.rates["touch"] * signal.numel() * stage.cost(signal, self.context)
 
     @staticmethod
-    def _channels(camera: Camera, scene: Scene) -> int | None:
-        for stage in camera:
-            if isinstance(stage, ColourFilter):
-                return stage.contraction(scene.wavelengths).shape[0]
-        return None
+    def _channels(camera: Camera) -> int | None:
+        return next((stage.planes for stage in camera if isinstance(stage, ColourFilter)), None)
 
     def _seconds(self, scene: Scene) -> float:
         return 0.0 if self.imaging is None else costs.seconds(self._work(scene, {}), self.rates)

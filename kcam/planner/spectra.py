@@ -101,7 +101,8 @@ class Spectra:
         self.optics, self.imaging, self.wavelengths = optics, optics.imaging, optics.wavelengths
         self.scene, self.weights, self.hidden = scene, weights, hidden
         self.frequencies = optics.frequencies
-        self.groups = [(rows, self.scene.samples(rows.tolist())) for rows in alike(scene)]
+        groups = alike(scene)
+        self.groups = [(rows, scene if len(groups) == 1 else scene.samples(rows.tolist())) for rows in groups]
         self._unlike = torch.ones(len(scene.coefficients), dtype=torch.float64)  # see `compare`
         self._framed = torch.ones_like(self._unlike)  # see `frame`
         self._layered: dict[tuple[int, Any], _Layered] = {}

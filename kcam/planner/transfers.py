@@ -88,6 +88,7 @@ class Transfers:
         self._ends = torch.stack([vergences.min(), vergences.max()])  # the farthest and the nearest
         self._stages: dict[Any, Imaging] = {}  # by changes
         self._tabled: dict[Any, bool] = {}  # by propagator
+        self._windows: dict[Any, tuple[int, int]] = {}  # by what a stage says of them, and vergences
         self._line_rows: dict[Any, Propagator] = {}  # whose lines are asked for, by propagator and window
         self._lines: dict[Any, Transfer] = {}  # the last, of other distances, by these and wavelengths
         self._tables: dict[Any, Table | None] = {} if imaging.known is None else dict(imaging.known.others)
@@ -190,7 +191,10 @@ class Transfers:
 
     def window(self, imaging: Imaging, vergences: Tensor) -> tuple[int, int]:
         """Of the PSFs of a stage [pixels]."""
-        return imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
+        key = imaging.accuracy.blur, imaging.accuracy.psf_shape, *vergences.tolist()
+        if key not in self._windows:
+            self._windows[key] = imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
+        return self._windows[key]
 
     @functools.cached_property
     def fits(self) -> bool:

@@ -419,13 +419,17 @@ class ColourFilter(Stage):
         response = self.response(wavelengths)
         return response @ (illuminant.double().cpu() * _shares(wavelengths)).to(response.device)
 
+    @property
+    def planes(self) -> int:
+        """How many planes the contraction gives: C for curves, 12 for a tile of Gaussians."""
+        return self.coefficients.shape[-1 if self.is_tile else 0]
+
     def contraction(self, wavelengths: Tensor) -> Tensor:
         """The weights over the bands, widths included: what an Imaging stage absorbs.
 
         forward(bands) = finish(sum_l contraction[k, l] bands[:, l])
 
-        Returns:   (K,L) float64, K = C for curves and 12 for a tile of Gaussians, whose coefficients are applied by
-                   `finish`.
+        Returns:   (K,L) float64, K = `planes`; the coefficients of a tile are applied by `finish`.
         """
         basis = self.basis(wavelengths) * _shares(wavelengths).to(self.coefficients.device)
         return basis if self.is_tile else self.alpha().double() @ basis
@@ -438,10 +442,9 @@ class ColourFilter(Stage):
         Raises:    ValueError for another number of planes.
         """
         alpha = self.alpha()
-        count = alpha.shape[-1] if self.is_tile else alpha.shape[0]
-        if planes.ndim < 3 or planes.shape[-3] != count:
+        if planes.ndim < 3 or planes.shape[-3] != self.planes:
             raise ValueError(
-                f"finish expects the {count} planes of the contraction, (..., {count}, H, W), "
+                f"finish expects the {self.planes} planes of the contraction, (..., {self.planes}, H, W), "
                 f"got shape {tuple(planes.shape)}."
             )
         if not self.is_tile:

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from kcam.cache import ValueCache
+from kcam.cache import ValueCache, seen
 from kcam.optics.elements.apertures import Aperture, rim_per_area
 from kcam.optics.elements.diffractive import DOE
 from kcam.optics.elements.element import Element, check_numbers, place_sensor
@@ -101,14 +101,22 @@ class ElementStack(nn.Module):
     @property
     def has_pixels(self) -> bool:
         """Whether an element is a map of flat pixels, a phase or a transmission."""
-        grid = wavelength_grid([self.focus_wavelength])
-        return any(element.pixel_map(grid) is not None for element in self.elements)
+        return bool(self._maps)
 
     @property
     def has_pixel_phase(self) -> bool:
         """Whether an element has its phase on flat pixels, which has no slope."""
-        grid = wavelength_grid([self.focus_wavelength])
-        return any(pixels.factors is not None for pixels in self.pixel_maps(grid))
+        return any(self._maps)
+
+    @property
+    def _maps(self) -> list[bool]:
+        """Of each map of flat pixels, whether it is one of the phase."""
+
+        def look() -> list[bool]:
+            grid = wavelength_grid([self.focus_wavelength])
+            return [pixels.factors is not None for pixels in self.pixel_maps(grid)]
+
+        return seen(self, "maps", look)
 
     def pixel_maps(self, wavelengths: Tensor) -> list[PixelMap]:
         """The maps of flat pixels among the elements, for wavelengths (L,) [m], in the order of the light."""

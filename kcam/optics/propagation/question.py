@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, differentiated
+from kcam.cache import ValueCache, differentiated, seen
 from kcam.optics.elements.element import Element
 from kcam.optics.elements.stack import ElementStack
 from kcam.optics.propagation import sampling
@@ -198,10 +198,11 @@ class Query:
     def spread(self, share: float) -> Tensor:
         """As `displacement`, for another share of the light that a profile of rings may scatter beyond it."""
         with torch.no_grad():
-            scattered = (share, self.wavelengths) if self.has_rings else ()  # by the outermost of these
-            asked = self.lens, _outermost(self).vergences, self.device, self.paraxial, scattered
-            known: dict[float, float] = _DISPLACEMENTS.get(asked, dict)  # by wavelength
             wavelengths = self.wavelengths.tolist()
+            scattered = (share, *wavelengths) if self.has_rings else ()  # by the outermost of these
+            ends = *map(float, self.vergences.detach().aminmax()), self.device, self.paraxial
+            look = functools.partial(_DISPLACEMENTS.get, (self.lens, ends, scattered), dict[float, float])
+            known = seen(self.lens, ("spread", ends, scattered), look)  # by wavelength
             if missing := [index for index, wavelength in enumerate(wavelengths) if wavelength not in known]:
                 some = (
                     self if len(missing) == len(wavelengths) else replace(self, wavelengths=self.wavelengths[missing])
