@@ -8,7 +8,7 @@ PIP := $(BIN)/python $(PIP_INSTALL)
 WORKERS ?= 2
 # One thread per worker: torch's own threads fight over the cores that pytest-xdist already uses.
 # Neighbours go to one worker, which sets up what they share once.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help demo demo-data docs docs-all test test-slow test-all bench bench-peers bench-augmentation bench-planner bench-field bench-style bench-styles bench-data lint types check wheel-test clean
@@ -57,7 +57,7 @@ docs-all: $(VENV)/docs.stamp
 # Then some on a device that is pretended: what a GPU would refuse is refused there too.
 test: $(VENV)/dev.stamp
 	$(PYTEST) -m "not slow"
-	$(PYTEST) -m "not slow" --device pretend tests/test_devices.py
+	$(PYTEST) -n 0 -m "not slow" --device pretend tests/test_devices.py
 
 test-slow: $(VENV)/dev.stamp
 	$(PYTEST) -m slow

@@ -16,7 +16,7 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,22 +44,24 @@ def measure_pair(
 ) -> dict[str, Any]:
     """One pair: for each tolerance the estimate, the truth, and the times of the raw, by turns with the reference's.
 
-    rates: of this machine, as `costs.calibrate` found them. Of some a first picture is taken, too.
+    rates: of this machine, as `costs.calibrate` found them. Of some first pictures are taken, too, by turns as well.
     """
     camera, scene, text, again = PAIRS[kind](seed)
-    alone, first, wholes = {}, {}, []
+    wholes: list[float] = []
+    alone, first = ({tolerance: list[float]() for tolerance in FIRST} for _ in range(2))
     with torch.no_grad():
         planner = Planner(camera, scene)
         plans = [planner.plan(tolerance) for tolerance in tolerances]
-        if kind in TIMED:
-            alone = {tolerance: make_plan(camera, scene, tolerance=tolerance).planning_seconds for tolerance in FIRST}
-            wholes.append(_whole(camera, scene))
-            first = {tolerance: _whole(camera, scene, tolerance=tolerance) for tolerance in FIRST}
-            wholes.append(_whole(camera, scene))
         reference, truth = timed(camera, scene)
+        turns = rounds if reference < SLOW else 1
+        for _ in range(turns if kind in TIMED else 0):
+            wholes.append(_whole(camera, scene))
+            for tolerance in FIRST:
+                alone[tolerance].append(make_plan(camera, scene, tolerance=tolerance).planning_seconds)
+                first[tolerance].append(_whole(camera, scene, tolerance=tolerance))
         shots: list[list[tuple[float, Tensor]]] = [[] for _ in plans]
         references = [reference]
-        for turn in range(rounds if reference < SLOW else 1):
+        for turn in range(turns):
             for shot, plan in zip(shots, plans, strict=True):
                 shot.append(timed(plan.apply(camera), scene))
             if turn:
@@ -81,9 +83,9 @@ def measure_pair(
                 "calibrated_seconds": costs.seconds(planner.prices.work(plan.changes), rates),
                 "predicted_reference_seconds": plan.reference_seconds,
                 "planning_seconds": plan.planning_seconds,
-                "first_planning_seconds": alone.get(tolerance),
-                "first_seconds": first.get(tolerance),
-                "first_reference_seconds": statistics.mean(wholes) if wholes else None,
+                "first_planning_seconds": _median(alone.get(tolerance)),
+                "first_seconds": _median(first.get(tolerance)),
+                "first_reference_seconds": _median(wholes),
                 "changes": plan.changes,
             }
         )
@@ -131,6 +133,10 @@ def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
         }
         print(kind, {name: value for name, value in content[kind].items() if name != "all"})
     measure.write_json(out, content)
+
+
+def _median(seconds: Sequence[float] | None) -> float | None:
+    return statistics.median(seconds) if seconds else None
 
 
 def _whole(camera: Camera, scene: Scene, **how: Any) -> float:

@@ -327,7 +327,7 @@ def test_what_cannot_be_is_a_clear_error() -> None:
 # ---- between what is traced ------------------------------------------------------------------------------------------
 
 
-NAMES = ("phone", "ef50", "cooke_triplet", "tessar", "wide_angle", "double_gauss", "telephoto")
+NAMES = ("cooke_triplet", "phone", "ef50", "tessar", "wide_angle", "double_gauss", "telephoto")
 
 
 def some(names: tuple[str, ...], *, quick: int) -> list:
