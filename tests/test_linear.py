@@ -273,7 +273,7 @@ def test_light_becomes_a_scene_again() -> None:
 # ---- derivatives --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene_of", [*(pytest.param(scene_of, marks=pytest.mark.slow) for scene_of in (pictured, cube)), mapped])
+@pytest.mark.parametrize("scene_of", [*(pytest.param(own, marks=pytest.mark.slow) for own in (pictured, cube)), mapped])
 def test_gradients_reach_light_raw_lens_and_filter(scene_of: Callable[[Draw], Scene]) -> None:
     draw = Draw(5)
     scene = scene_of(draw).crop(top=4, left=5, height=5, width=6)

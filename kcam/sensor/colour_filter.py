@@ -421,7 +421,7 @@ class ColourFilter(Stage):
 
     @property
     def planes(self) -> int:
-        """How many planes the contraction gives: C for curves, 12 for a tile of Gaussians."""
+        """How many planes the contraction gives: one for each curve, or for each Gaussian of a tile."""
         return self.coefficients.shape[-1 if self.is_tile else 0]
 
     def contraction(self, wavelengths: Tensor) -> Tensor:
