@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import Any, Protocol, Unpack
+from typing import Any, Protocol, TypeVar, Unpack
 
 import torch
 from torch import Tensor
@@ -43,6 +44,8 @@ _SETTINGS = _DEFAULT.settings().keys()
 _RECIPE = {field.name for field in fields(Recipe)}
 _FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
 _TRACED = 4  # lenses, at some vergences and wavelengths, whose pupils are kept
+
+T = TypeVar("T")
 
 
 class Absorber(Curves, Protocol):
@@ -347,8 +350,7 @@ class Imaging(Stage):
         if not self.accuracy.blur:
             return Defocus()
         find = functools.partial(self.lens.defocus, wavelengths, self.pixel_pitch)
-        how = "defocus", self.pixel_pitch, *wavelengths.tolist()
-        return find() if self.known is None else self.known.once((self.lens,), how, find)
+        return self._once((self.lens,), ("defocus", self.pixel_pitch, *wavelengths.tolist()), find)
 
     def psf_bank(self, wavelengths: Tensor, *, vergences: Tensor, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs of the bands of a scene at one distance, (Z, L, h, w) in the dtype and on the device of `like`; kept
@@ -399,8 +401,11 @@ class Imaging(Stage):
         return planes.double() if planes.dtype == torch.float64 or self._wide(scene) else planes.float()
 
     def _wide(self, scene: Scene) -> bool:
-        look = functools.partial(wide_range, scene)
-        return look() if self.known is None else self.known.once((scene.coefficients, scene.spectra), "range", look)
+        return self._once((scene.coefficients, scene.spectra), "range", functools.partial(wide_range, scene))
+
+    def _once(self, parts: tuple[object, ...], how: object, look: Callable[[], T]) -> T:
+        """What a look tells, which is kept while the stage is `knowing`: see `KnownPSFs.once`."""
+        return look() if self.known is None else self.known.once(parts, how, look)
 
     def vergences(self, scene: Scene, depth: Tensor, *, wavelengths: Tensor | None = None) -> Tensor:
         """Of the layers that a scene is cut into, (Z,) [1/m]: half as far apart where a few lights stand out, whose own
@@ -412,10 +417,10 @@ class Imaging(Stage):
             fine = depth.numel() > 1 and self._wide(scene)
             return self.depth_layers(depth, light, waves=LAYER_WAVES / 2 if fine else LAYER_WAVES)
 
-        if self.known is None or differentiated(depth):
+        if differentiated(depth):
             return cut()
         how = self.accuracy.layers, self.accuracy.blur, depth.device, tuple(light.tolist())
-        return self.known.once((scene.coefficients, scene.depth), how, cut)
+        return self._once((scene.coefficients, scene.depth), how, cut)
 
     def layers_of(self, scene: Scene, planes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Vergences of the layers in which there is anything, (Z,) [1/m], and the share of each pixel in them,

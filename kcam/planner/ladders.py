@@ -22,7 +22,7 @@ from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.planner.ladder import Ladder, Level
-from kcam.planner.spectra import Care
+from kcam.planner.spectra import PARAXIAL, Care
 from kcam.planner.survey import RANKS
 from kcam.scene import Scene
 
@@ -92,8 +92,8 @@ FEWEST = 64
 URGENT = 10.0
 """Of what saves next to nothing: it is left out where it matters ten times less than what else is."""
 
-EXACT, PARAXIAL = "nonparaxial", {"propagator": "fresnel"}
-"""Models. What other choices cost is the same in both, to 10 % (of 24 maps of pixels, f/5 to f/50)."""
+EXACT = "nonparaxial"
+"""The model beside `PARAXIAL`. What other choices cost is the same in both, to 10 % (of 24 maps, f/5 to f/50)."""
 
 CANCELLED = {torch.float32: 2e-5, torch.float64: 1e-13}
 """What is left of a picture's precision where planes of either sign add up to it."""
@@ -229,17 +229,18 @@ def _blur(view: _View) -> Iterator[Ladder]:
 
 def _model(view: _View) -> Iterator[Ladder]:
     """Paraxial only where that is cheaper: a map of pixels needs no warp then."""
-    if not view.stand_in or (view.one and not view.evaluator.certain):
+    query, row = view.query, view.row
+    if not view.stand_in or query is None or row is None or (view.one and not view.evaluator.certain):
         return
     beside = {name: value for name, value in view.few().items() if name not in PARAXIAL}
     ladder = Ladder("model", [Level("fresnel", PARAXIAL), Level(EXACT, {})], beside, doubtful=True, tried=True)
     if view.evaluator.certain:
         ladder.off_by, ladder.little = BY_ONE_MODEL, math.inf
-        if view.row is not None and view.row.lines_of is not None and view.imaging.integrate:
+        if row.lines_of is not None and view.imaging.integrate:
             ladder.takes = TAKES
-        tau, few = 0.0 if view.query is None else float(view.query.tau.detach()), view.evaluator.few_lights
+        tau, few = float(query.tau.detach()), view.evaluator.few_lights
         ladder.foreseen = FORESEEN[few] * tau
-        if view.query is not None and not few:
+        if not few:
             ladder.bounds, ladder.small = {0: BEYOND * (tau + view.evaluator.left_out / 10)}, SMALL_BEYOND
     yield ladder
 

@@ -45,6 +45,9 @@ COLOURS = {"bands", "interpolate_bands"}
 WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 """Of these, those whose error is that of the PSFs themselves, not of what they are computed for."""
 
+PARAXIAL = {"propagator": "fresnel"}
+"""The model that leaves out what spheres have beyond their parabolas, as changes of an Imaging."""
+
 WINDOW = {"psf_shape", "renormalise"}
 """Of those, those of the window alone."""
 
@@ -309,7 +312,7 @@ class Spectra:
             factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
         if _differ(changes, against, {"interpolate_bands"}):
             factor = factor * self.optics.between_psfs
-        if changes.get("propagator") == against.get("propagator") == "fresnel":
+        if PARAXIAL.items() <= changes.items() and PARAXIAL.items() <= against.items():
             factor = factor * self.optics.by_paraxial
         for index, (rows, _) in enumerate(self.groups):
             layered = self._of(index, against.get("layers"))
