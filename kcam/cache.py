@@ -64,7 +64,13 @@ def unchanged() -> Iterator[None]:
 
 
 def seen(thing: object, what: Hashable, look: Callable[[], T]) -> T:
-    """What a look at a thing finds, which is kept while all is `unchanged`."""
+    """What a look at a thing finds, which is kept while all is `unchanged`, if it can be known what the thing is."""
+    if _SEEN.get() is None or not _seen(thing, "known", lambda: _is_known(thing)):
+        return look()
+    return _seen(thing, what, look)
+
+
+def _seen(thing: object, what: Hashable, look: Callable[[], T]) -> T:
     known = _SEEN.get()
     if known is None:
         return look()
@@ -72,6 +78,14 @@ def seen(thing: object, what: Hashable, look: Callable[[], T]) -> T:
     if key not in known:
         known[key] = thing, look()  # held, for another may get its id
     return known[key][1]  # type: ignore[no-any-return]
+
+
+def _is_known(thing: object) -> bool:
+    try:
+        value_of(thing, [])
+    except Unknown:
+        return False
+    return True
 
 
 def differentiated(tensor: Tensor) -> bool:
@@ -95,7 +109,7 @@ def value_of(thing: Any, tensors: list[Tensor], *, within: tuple[int, ...] = ())
         own: list[Tensor] = []
         return _value_of(thing, own, within), own
 
-    value, own = seen(thing, "value", look)
+    value, own = _seen(thing, "value", look)
     tensors += own
     return value
 

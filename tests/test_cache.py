@@ -35,6 +35,7 @@ from kcam.optics import accuracy as accuracy_module
 from kcam.optics.propagation.table import choose
 from kcam.optics.propagation.textbook import textbook_row
 from kcam.optics.rendering.renderer import Renderer
+from kcam.units import mm, um
 
 # torch itself uses what it deprecates, when it first meets a tangent
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
@@ -787,6 +788,35 @@ def test_while_nothing_changes_a_module_is_looked_at_once() -> None:
     assert value_of(lens, []) != value
     with unchanged():
         assert value_of(lens, []) != value
+
+
+class Refocusing(optics.Lens):
+    """It promises nothing, and moves its sensor once its window is known."""
+
+    then = 0.0
+
+    def bank(self, *asked: Any, **how: Any) -> Tensor:
+        self.sensor_distance = self.then
+        return super().bank(*asked, **how)
+
+
+def test_of_what_may_change_while_it_is_used_nothing_is_kept() -> None:
+    parts = optics.SquareAperture(4 * mm), optics.ThinLens(50 * mm)
+    sharp, blurred = (optics.Lens(*parts, focus_distance=distance) for distance in (1.2, 0.3))
+    lens = Refocusing(*parts, sensor_distance=sharp.sensor_distance)
+    lens.then = blurred.sensor_distance
+    scene = scene_of(bands=True)
+    taken = optics.Imaging(lens, pixel_pitch=4 * um)(scene)
+    window = optics.Imaging(sharp, pixel_pitch=4 * um).psf_window(
+        scene.wavelengths, vergences=torch.tensor([1 / 1.2], dtype=DOUBLE), picture=scene.shape[1:]
+    )
+    expected = optics.Imaging(blurred, pixel_pitch=4 * um, psf_shape=window)(scene)
+    torch.testing.assert_close(taken, expected)
+    looks: list[int] = []
+    with unchanged():
+        for _ in range(2):
+            seen(lens, "looks", lambda: looks.append(1))
+    assert len(looks) == 2
 
 
 def test_other_defaults_of_torch_are_other_values() -> None:
