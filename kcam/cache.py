@@ -53,9 +53,6 @@ class Unknown(Exception):
 @contextlib.contextmanager
 def unchanged() -> Iterator[None]:
     """While no module changes: what is `seen` of each is then looked at once, not whenever it is asked."""
-    if torch.compiler.is_compiling():
-        yield
-        return
     token = _SEEN.set(_SEEN.get() or {})
     try:
         yield

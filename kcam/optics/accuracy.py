@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, TypedDict
 
 import torch
@@ -118,14 +118,14 @@ class Accuracy(Recipe):
         if shape is not None and not (isinstance(shape, Sequence) and len(shape) == 2 and all(map(is_count, shape))):
             fix = f" Use ({shape}, {shape})." if is_count(shape) else ""
             raise ValueError(f"psf_shape must be two positive integers (H, W) in pixels, or None, got {shape!r}.{fix}")
-        if self.kappa is not None and not self.kappa > 1:
-            raise ValueError(f"kappa must be above 1 sample per fringe, got {self.kappa:g}. Its default is {KAPPA:g}.")
+        if self.kappa is not None and not (isinstance(self.kappa, Real) and self.kappa > 1):
+            raise ValueError(f"kappa must be above 1 sample per fringe, got {self.kappa!r}. Its default is {KAPPA:g}.")
         if self.precision not in (None, "float32", "float64"):
             raise ValueError(
                 f'precision must be "float32", "float64" or None for the scene\'s, got {self.precision!r}.'
             )
-        if not self.max_memory > 0:
-            raise ValueError(f"max_memory must be a positive number of bytes, got {self.max_memory:g}.")
+        if not (isinstance(self.max_memory, Real) and self.max_memory > 0):
+            raise ValueError(f"max_memory must be a positive number of bytes, got {self.max_memory!r}.")
         own: dict[str, Any] = {"max_memory": float(self.max_memory)}
         own |= {} if self.layers is None else {"layers": _count_or_distances(self.layers)}
         own |= {} if shape is None else {"psf_shape": (int(shape[0]), int(shape[1]))}

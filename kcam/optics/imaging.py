@@ -7,6 +7,7 @@ How the picture is convolved stands in `rendering`; here is which PSFs, for whic
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from typing import Any, Protocol, TypeVar, Unpack
 import torch
 from torch import Tensor
 
-from kcam.cache import ValueCache, differentiated, has_derivative, unchanged
+from kcam.cache import ValueCache, differentiated, has_derivative
 from kcam.context import Context, Curves, Stage, arguments_text
 from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
@@ -174,7 +175,7 @@ class Imaging(Stage):
             if arguments.keys() & _RECIPE:
                 changed._check_recipe(known=True)
         else:
-            changed = Imaging(**(self.configuration() | arguments))
+            changed = type(self)(**(self.configuration() | arguments))
         shared = ["_traced_cache", "_window_cache", "_reach", "known"]
         ours, theirs = self.accuracy, changed.accuracy
         if (ours.bands, ours.lateral_colour, ours.blur) == (theirs.bands, theirs.lateral_colour, theirs.blur):
@@ -184,12 +185,11 @@ class Imaging(Stage):
         return changed
 
     def _with(self, accuracy: Accuracy) -> Imaging:
-        """The same stage with another accuracy, which has kept nothing."""
-        changed = Imaging.__new__(Imaging)
-        super(Imaging, changed).__init__()
-        own = vars(self) | vars(changed)  # torch's own are new
+        """The same stage, hooks and all, with another accuracy, which has kept nothing."""
+        changed = type(self).__new__(type(self))
+        own = {name: copy.copy(value) if isinstance(value, dict | set) else value for name, value in vars(self).items()}
         own |= {name: ValueCache() for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache")}
-        vars(changed).update(own, _modules=dict(vars(self)["_modules"]), accuracy=accuracy)
+        vars(changed).update(own, accuracy=accuracy)
         if accuracy.propagator is not self.accuracy.propagator:
             changed.accuracy = accuracy
         return changed
@@ -247,7 +247,6 @@ class Imaging(Stage):
         """The optics, for exposure in physical units."""
         return {"lens": self.lens, "pixel_pitch": self.pixel_pitch, "fill_factor": self.fill_factor}
 
-    @unchanged()
     def forward(
         self, scene: Scene | Tensor, context: Context | None = None, *, colour_filter: Absorber | None = None
     ) -> Tensor:

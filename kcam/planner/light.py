@@ -27,15 +27,19 @@ FEW = 64
 """Pixels, or patches, that are few."""
 
 _PATCH = 4  # side of patches of light [pixels]
+_PALE = 0.03  # of the energy of contrast, that hues may leave out
 _WHOLE = 3e-3, 1e-4  # of a scene's light, that planes of fewer spectra may leave out: errors differ by 1 %
 
 
 def linear(camera: Camera) -> bool:
-    """Whether a camera's noiseless raw is linear in light that is not clipped, and its PSF one all over."""
-    known = (Clip, ColourFilter, DarkCurrent, Exposure, Imaging, Mosaic, ReadNoise, ShotNoise, Transmission)
-    stages = [stage.stage if isinstance(stage, Mean) else stage for stage in camera]
+    """Whether a camera's noiseless raw is linear in light that is not clipped, and its PSF one all over: as far as that
+    is known, of stages of these very classes without hooks.
+    """
+    known = {Clip, ColourFilter, DarkCurrent, Exposure, Imaging, Mosaic, ReadNoise, ShotNoise, Transmission}
+    stages: list[Any] = [stage.stage if isinstance(stage, Mean) else stage for stage in camera]
     one = all(getattr(stage.lens, "positions", None) is None for stage in stages if isinstance(stage, Imaging))
-    return one and all(isinstance(stage, known) for stage in stages)
+    hooked = any(stage._forward_hooks or stage._forward_pre_hooks for stage in (*camera, *stages))
+    return one and not hooked and all(type(stage) in known for stage in stages)
 
 
 def recorded(camera: Camera, scene: Scene) -> Tensor | None:
@@ -80,6 +84,31 @@ def compressed(scene: Scene) -> Scene:
             with contextlib.suppress(ValueError):  # light would be negative somewhere, by more than a scene lets pass
                 return replace(scene, coefficients=torch.einsum("bkhw,kr->brhw", planes, spectra @ few), spectra=few.T)
     return scene
+
+
+def hues(scene: Scene, weights: Tensor | None) -> Tensor:
+    """What is recorded of each pixel in sums of bands (R, L), or in all bands, as the fewest planes (B, J, H, W) whose
+    squares add up to it, but for `_PALE` of its contrast: of light that all bands blur alike.
+    """
+    planes = scene.coefficients.detach()
+    planes = planes.to(torch.promote_types(planes.dtype, torch.float32))
+    spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).double().cpu()
+    sums = spectra if weights is None else spectra @ weights.double().cpu().T  # (K, R)
+    flat = planes.flatten(2) / planes.flatten(1).norm(dim=1).clamp(min=torch.finfo(planes.dtype).tiny)[:, None, None]
+    grams = (flat @ flat.mT).double().cpu().sum(0)
+    means = flat.mean(-1).double().cpu()
+    even = flat.shape[-1] * means.T @ means
+    energies, directions = torch.linalg.eigh(sums.T @ grams @ sums)
+    contrast = float((sums.T @ (grams - even) @ sums).trace())
+    few = energies.clamp(min=0).cumsum(0) > _PALE * contrast
+    few[-1] = True
+    return torch.einsum("bkhw,kj->bjhw", planes, (sums @ directions[:, few]).to(planes))
+
+
+def contrast(planes: Tensor) -> Tensor:
+    """The energy of what differs from their means, of that of planes (B, K, H, W): (B,)."""
+    flat = planes.detach().double().cpu().flatten(2)
+    return flat.var(-1, correction=0).sum(1) / flat.square().mean(-1).sum(1).clamp(min=1e-300)
 
 
 def few_lights(light: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ import functools
 import math
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -116,7 +117,7 @@ class Planner:
     ) -> None:
         start = time.perf_counter()
         self.camera, self.one = camera, one
-        self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+        self.scenes = list(scenes) if isinstance(scenes, Iterable) and not isinstance(scenes, Scene) else [scenes]
         _check_scenes(self.scenes, max_memory)
         self.evaluator = Evaluator(camera, self.scenes)
         always = {} if max_memory is None else {"max_memory": float(max_memory)}
@@ -143,6 +144,7 @@ class Planner:
         """The plan for a tolerance."""
         start = time.perf_counter()
         check_tolerance(tolerance)
+        tolerance = tolerance if isinstance(tolerance, str) else float(tolerance)
         rows = _Rows(self.prices)
         shortcuts: dict[int, dict[str, Any] | None] = {}
         allowed, checked = 0.0, None
@@ -327,15 +329,15 @@ def _check_scenes(scenes: Sequence[Any], max_memory: float | None) -> None:
             raise TypeError(f"a plan is for scenes, got {type(scene).__name__}. Use Scene.from_rgb(image, depth=2.0).")
     if len({tuple(scene.wavelengths.tolist()) for scene in scenes}) > 1:
         raise ValueError("the scenes have different wavelengths. Plan together for those of the same.")
-    if max_memory is not None and not max_memory > 0:
-        raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory:g}.")
+    if max_memory is not None and not (isinstance(max_memory, Real) and max_memory > 0):
+        raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory!r}.")
 
 
 def check_tolerance(tolerance: Any) -> None:
     """ValueError for what is no tolerance of a plan."""
     if isinstance(tolerance, str) and tolerance != SENSOR:
         raise ValueError(f'unknown tolerance "{tolerance}": expected a number such as 0.01, or "{SENSOR}".')
-    number = isinstance(tolerance, (int, float)) and not isinstance(tolerance, bool)
+    number = isinstance(tolerance, Real) and not isinstance(tolerance, bool)
     if not isinstance(tolerance, str) and not (number and 0 <= tolerance < math.inf):
         raise ValueError(f'tolerance must be a relative error >= 0 such as 0.01, or "{SENSOR}", got {tolerance!r}.')
 

@@ -31,7 +31,7 @@ from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.cross_spectra import cross_spectra
-from kcam.planner.light import UNSEEN, blurred, compressed, few_lights, lights, recorded
+from kcam.planner.light import UNSEEN, blurred, compressed, contrast, few_lights, hues, lights, recorded
 from kcam.planner.transfers import GROUPS, Transfers, Way
 from kcam.scene import Scene
 
@@ -108,6 +108,7 @@ class Spectra:
         self.groups = [(rows, scene if len(groups) == 1 else scene.samples(rows.tolist())) for rows in groups]
         self._unlike = torch.ones(len(scene.coefficients), dtype=torch.float64)  # see `compare`
         self._framed = torch.ones_like(self._unlike)  # see `frame`
+        self._hues: Tensor | None = None  # planes instead of the scene's, whose squares add up
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._energies_known: dict[tuple[Any, ...], Tensor] = {}
@@ -188,14 +189,23 @@ class Spectra:
     @functools.cached_property
     def grey(self) -> Spectra:
         """The same in light of a few wavelengths, as much of each as is recorded around it: depth, and what hides what,
-        have no colour, but lenses have.
+        have no colour, but lenses have. Its hues are those of what is recorded: of colours that are as bright as each
+        other the sum shows nothing.
         """
         stage, few = self.optics.stage({"bands": FEW_BANDS}), self.optics.few
         shares = stage.shares(self.wavelengths)
         much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
         light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=UNSEEN)[None].to(self._light)
         grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
-        return Spectra(self.optics, grey, None)
+        found = Spectra(self.optics, grey, None)
+        found._hues = hues(self.scene, self.weights)
+        return found
+
+    @functools.cached_property
+    def _coloured(self) -> Tensor:
+        """Times the contrast of grey light, in energy, that there is in its hues, (B,), at least 1."""
+        hues = self._light if self._hues is None else self._hues
+        return (contrast(hues) / contrast(self._light).clamp(min=UNSEEN)).clamp(min=1)
 
     @functools.cached_property
     def _light(self) -> Tensor:
@@ -291,13 +301,15 @@ class Spectra:
         stage = self.grey._cutting(grey, against.get("layers"))
         changed = (stage.changed(**{**own, "bands": None}) for own in (changes, against))
         ours, theirs = (imaging(grey).double().cpu() for imaging in changed)
-        return (ours - theirs).square().sum((1, 2, 3)), theirs.square().sum((1, 2, 3))
+        off = (ours - theirs).square().sum((1, 2, 3)) * self.grey._coloured[rows]
+        return off, theirs.square().sum((1, 2, 3))
 
     def _linear(
         self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        if _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES):
+        by_psfs = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
+        if by_psfs or (_differ(changes, against, COLOURS) and self.optics.missed):
             way = Way.PSFS
         elif care is Care.AT_FIRST:
             way = Way.WHOLE_LINES
@@ -365,10 +377,12 @@ class Spectra:
             imaging = self._cutting(scene, layers)
             planes = imaging.working(scene)
             vergences, shares = imaging.layers_of(scene, planes)
-            if shares is not None:
-                planes = (planes[:, :, None] * shares[:, None]).flatten(1, 2)
-            dark = imaging.border == "zero"
-            crossed = torch.stack([cross_spectra(own, self.frequencies, dark=dark) for own in planes])
+            if self._hues is not None:
+                planes = self._hues[self.groups[index][0]].to(planes)
+            planes = planes[:, :, None] if shares is None else planes[:, :, None] * shares[:, None]
+            apart = planes.flatten(1, 2)[:, None] if self._hues is None else planes
+            look = functools.partial(cross_spectra, frequencies=self.frequencies, dark=imaging.border == "zero")
+            crossed = torch.stack([torch.stack([*map(look, own)]).sum(0) for own in apart])
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
 

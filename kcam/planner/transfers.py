@@ -42,6 +42,8 @@ _BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others:
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
 # what models differ in; else it holds more or less by this times (a / d)^2: 0.4 to 1.3 times what 53 maps of pixels do
+_HARDLY = 0.04  # of the light of a smooth pupil, that a window holds, below which line spreads do not tell what is in
+# it: 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -202,14 +204,11 @@ class Transfers:
         return self._widest is None or _inside(self._widest)
 
     @functools.cached_property
-    def _folded_across(self) -> bool:
+    def folded_across(self) -> bool:
         """Whether light finer than the pixels counts in all directions, of pixels that do not integrate: slices
         straight from the pupil tell of what is folded along them.
         """
-        if self.imaging.integrate or (query := self._widest) is None:
-            return False
-        (a, d), finest = query.scale, float(query.wavelengths.min())
-        return 2 * a * query.pixel_pitch > d * finest
+        return self._widest is not None and self._widest.folded
 
     @functools.cached_property
     def corners(self) -> float:
@@ -218,6 +217,13 @@ class Transfers:
         if query is None or query.has_pixel_phase or self.fits:
             return 1.0
         return _CUT_ROUND if query.symmetric else _CUT
+
+    @functools.cached_property
+    def missed(self) -> bool:
+        """Whether hardly any light of a smooth pupil, as far as line spreads tell, falls into the window."""
+        if self.fits or self._widest is None or self._widest.has_pixels:
+            return False
+        return float(self.of(self.imaging, self._ends.unique(), self.few, Way.LINES)[0][..., 0].real.max()) < _HARDLY
 
     def untold(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> float:
         """What a picture of the paraxial model errs at least, behind maps of pixels whose light mostly misses the
@@ -260,7 +266,7 @@ class Transfers:
         if not isinstance(lens := imaging.lens, Lens):
             return None
         pixels = imaging.pixels(window, torch.empty(0, dtype=torch.float64))
-        return lens.question(Points(vergences), wavelengths, pixels, imaging.accuracy)
+        return replace(lens.question(Points(vergences), wavelengths, pixels, imaging.accuracy), whole=True)
 
     def table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, grey: bool = False) -> Table | None:
         """Transfer functions of these wavelengths and others, where optics know them without PSFs.
@@ -268,7 +274,7 @@ class Transfers:
         Of many layers, and in grey light, a few wavelengths have a table, else all for which PSFs may stand. One layer
         of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
         """
-        if self._folded_across:
+        if self.folded_across:
             return None
         one = self.deep and len(vergences) == 1
         among = torch.cat([self._ends[:1], vergences.cpu(), self._ends[1:]]) if one else vergences
@@ -303,7 +309,7 @@ class Transfers:
 
     def lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Table | None:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
-        if self._folded_across:
+        if self.folded_across:
             return None
         window, some = self.window(imaging, vergences), self._every_and(wavelengths)
         lens, bands = (imaging.accuracy.propagator, window), tuple(some.tolist())

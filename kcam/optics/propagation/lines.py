@@ -103,6 +103,8 @@ class LineTransfer:
             into, asked, weights = self._folded(frequencies)
             found = _between(table, asked * (2 * length * step)[:, None]) * weights
             total = found.new_zeros(*found.shape[:-1], len(frequencies)).index_add_(-1, into, found)
+            if query.has_gaps:
+                total = sampling.of_whole_pixels(total, found[..., (into == 0) & (asked == 0)])
             return total.permute(2, 0, 1, 3)
 
     def _folded(self, frequencies: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -254,6 +254,17 @@ class Query:
                 passed = passed * pixel_under(pixels.values.to(axis), pixels.half_width, axis, self.semi_aperture)
         return passed
 
+    @property
+    def folded(self) -> bool:
+        """Whether pixels see points of light that is finer than they are."""
+        (a, d), finest = self.scale, float(self.wavelengths.min())
+        return not self.grid.integrate and 2 * a * self.pixel_pitch > d * finest
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether it is scaled to what whole pixels receive together, and these are not what is integrated over."""
+        return self.whole and self.grid.integrate and self.grid.active < 1
+
     def pixels(self, per_pixel: float) -> Pixels:
         """The pixels that are asked for, over so many points each."""
         return Pixels(self.shape, per_pixel, active=self.grid.active, integrate=self.grid.integrate, whole=self.whole)

@@ -107,6 +107,7 @@ class RadialTransfer:
                step: of t [pixels], (L,). kappa: entries of the kernel for each cycle per pixel, (L,).
                rims: of each rim T, (R, L, 1), and b, (R, L, Z) [pixels].
                active: width of the light-sensitive part of a pixel; 0 where no pixel is integrated over.
+               whole: scaled to what whole pixels receive together, see `sampling.of_whole_pixels`.
     """
 
     light: Tensor
@@ -115,6 +116,7 @@ class RadialTransfer:
     kappa: Tensor
     rims: tuple[Tensor, Tensor]
     active: float
+    whole: bool
 
     def __call__(self, frequencies: Tensor, shape: tuple[int, int], bands: Sequence[int]) -> Tensor:
         """As `Transfer`: float64, the same along x and y."""
@@ -128,7 +130,10 @@ class RadialTransfer:
         place = (kappa[:, None] * asked.abs()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
         value = even_between(table, place) * weights
         found = value.new_zeros(*value.shape[:-1], len(frequencies)).index_add(-1, index, value)
-        found = found + self._beyond(frequencies, shape, chosen)
+        beyond = self._beyond(frequencies, shape, chosen).expand_as(found)
+        found = found + beyond
+        if self.whole:
+            found = sampling.of_whole_pixels(found, value[..., (index == 0) & (asked == 0)] + beyond[..., :1])
         return found.transpose(0, 1)[:, :, None].expand(-1, -1, 2, -1)
 
     def _beyond(self, frequencies: Tensor, shape: tuple[int, int], chosen: Tensor) -> Tensor:
@@ -173,6 +178,7 @@ def radial_transfer(query: Query) -> RadialTransfer:
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
         rims=rims,
         active=query.grid.active if query.grid.integrate else 0.0,
+        whole=query.has_gaps,
     )
 
 

@@ -101,6 +101,14 @@ def along_axis(frequencies: Tensor) -> tuple[Tensor, Tensor]:
     return along, (frequencies.square() - along.square()).clamp(max=0.25).sqrt()
 
 
+def of_whole_pixels(found: Tensor, alone: Tensor) -> Tensor:
+    """Slices of a transfer function (..., F), from frequency 0 on, of pixels with gaps, scaled to the light that whole
+    ones receive: that which no aliases fold onto frequency 0, (..., 1).
+    """
+    light = found[..., :1].real if found.is_complex() else found[..., :1]
+    return found * (alone / light.clamp(min=1e-30))
+
+
 def folded(frequencies: Tensor, cutoff: float, active: float) -> tuple[Tensor, Tensor, Tensor]:
     """Light up to a cutoff, 2 a / (lambda d) [cycles per pixel], that pixels of an active width fold into frequencies
     along an axis (F,), see `along_axis`: into which of them, (N,); its own frequency, below 0 on the other side of the

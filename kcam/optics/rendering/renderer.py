@@ -32,6 +32,7 @@ class Renderer(Bank):
         """How masks (B, 1, H, W) spread in each channel, relative to the PSFs' own sum: (B, C, H, W)."""
         weights = self.kappa()
         sums = self.grouped(weights) @ self.psfs[layer].sum((-2, -1))
+        sums = torch.where(sums == 0, 1, sums)  # a channel that records none of these bands is covered by nothing
         return self._of_masks(weights / sums[:, None]).blur(share, layer=layer)
 
     def near(self, place: Place, *, batch: int) -> Renderer | None:
