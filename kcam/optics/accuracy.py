@@ -16,7 +16,7 @@ from kcam.optics.propagation.row import Propagator
 from kcam.optics.propagation.sampling import KAPPA
 from kcam.optics.propagation.table import PHYSICS, choose
 from kcam.optics.source import is_count
-from kcam.units import check_distances
+from kcam.units import as_numbers, check_distances
 
 COVERAGES = ("channel", "band")
 OVER_THE_FIELD = ("field_variation", "distortion", "lateral_colour", "relative_illumination")
@@ -119,13 +119,15 @@ class Accuracy(Recipe):
             fix = f" Use ({shape}, {shape})." if is_count(shape) else ""
             raise ValueError(f"psf_shape must be two positive integers (H, W) in pixels, or None, got {shape!r}.{fix}")
         if self.kappa is not None and not (isinstance(self.kappa, Real) and self.kappa > 1):
-            raise ValueError(f"kappa must be above 1 sample per fringe, got {self.kappa!r}. Its default is {KAPPA:g}.")
+            given = as_numbers(self.kappa, name="kappa", expected="a number above 1 sample per fringe")
+            raise ValueError(f"kappa must be above 1 sample per fringe, got {given:g}. Its default is {KAPPA:g}.")
         if self.precision not in (None, "float32", "float64"):
             raise ValueError(
                 f'precision must be "float32", "float64" or None for the scene\'s, got {self.precision!r}.'
             )
         if not (isinstance(self.max_memory, Real) and self.max_memory > 0):
-            raise ValueError(f"max_memory must be a positive number of bytes, got {self.max_memory!r}.")
+            given = as_numbers(self.max_memory, name="max_memory", expected="a positive number of bytes")
+            raise ValueError(f"max_memory must be a positive number of bytes, got {given:g}.")
         own: dict[str, Any] = {"max_memory": float(self.max_memory)}
         own |= {} if self.layers is None else {"layers": _count_or_distances(self.layers)}
         own |= {} if shape is None else {"psf_shape": (int(shape[0]), int(shape[1]))}

@@ -211,6 +211,11 @@ class Evaluator:
         """RMS of what the paraxial model leaves out of the phase of any scene [rad]."""
         return max((spectra.optics.left_out for spectra in self.spectra or ()), default=0.0)
 
+    @property
+    def missed(self) -> bool:
+        """Whether hardly any light falls into the window of some scene: see `Transfers`."""
+        return any(spectra.optics.missed for spectra in self.spectra or ())
+
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether all wavelengths may be compared at no cost."""
         return self.spectra is not None and all(spectra.tabled(settings) for spectra in self.spectra)

@@ -29,6 +29,7 @@ from kcam.planner.skips import Skip, shortcuts_of
 from kcam.scene import Scene
 from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free
+from kcam.units import as_numbers
 
 WORTH, WORTH_DEEP, WORTH_LIGHTS = 0.12, 0.19, 0.7
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, with a map of
@@ -330,7 +331,8 @@ def _check_scenes(scenes: Sequence[Any], max_memory: float | None) -> None:
     if len({tuple(scene.wavelengths.tolist()) for scene in scenes}) > 1:
         raise ValueError("the scenes have different wavelengths. Plan together for those of the same.")
     if max_memory is not None and not (isinstance(max_memory, Real) and max_memory > 0):
-        raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory!r}.")
+        given = as_numbers(max_memory, name="max_memory", expected="a positive number of bytes")
+        raise ValueError(f"max_memory must be a positive number of bytes, got {given:g}.")
 
 
 def check_tolerance(tolerance: Any) -> None:

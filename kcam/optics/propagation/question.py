@@ -254,11 +254,11 @@ class Query:
                 passed = passed * pixel_under(pixels.values.to(axis), pixels.half_width, axis, self.semi_aperture)
         return passed
 
-    @property
-    def folded(self) -> bool:
-        """Whether pixels see points of light that is finer than they are."""
+    def folded(self, active: float = 0.0) -> bool:
+        """Whether light is finer than the pixels, of which so much of their width at most is sensitive; 0: points."""
         (a, d), finest = self.scale, float(self.wavelengths.min())
-        return not self.grid.integrate and 2 * a * self.pixel_pitch > d * finest
+        sensitive = self.grid.active if self.grid.integrate else 0.0
+        return sensitive <= active and 2 * a * self.pixel_pitch > d * finest
 
     @property
     def has_gaps(self) -> bool:

@@ -1,0 +1,190 @@
+"""Classes of cameras and scenes that someone found with a generator of their own: plans hold for random members."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from draws import Draw
+from torch import Tensor, nn
+
+from kcam import Camera, Scene, optics, sensor
+from kcam.planner import Planner, make_plan, noiseless_raw, relative_rms, transfers
+from kcam.units import mm, nm, um
+
+TOLERANCES = (0.1, 0.03, 0.01)
+TOO_LOW = 0.7  # of what a plan errs, that it says at least
+
+
+def some(*, quick: int, slow: int) -> list[Any]:
+    return [*range(quick), *(pytest.param(n, marks=pytest.mark.slow) for n in range(quick, slow))]
+
+
+def check(camera: Camera, scene: Scene) -> None:
+    with torch.no_grad():
+        planner, truth = Planner(camera, scene), noiseless_raw(camera)(scene)
+        for tolerance in TOLERANCES:
+            plan = planner.plan(tolerance)
+            raw = noiseless_raw(plan.apply(camera))(scene)
+            error = max(relative_rms(a, b) for a, b in [(raw, truth), *zip(raw, truth, strict=True)])
+            assert error <= tolerance, f"{error / tolerance:.2f} of {tolerance} with {plan.changes}"
+            assert error < 1e-5 or plan.bound > TOO_LOW * error, f"{plan.bound / error:.2f} with {plan.changes}"
+
+
+def bayer() -> tuple[nn.Module, ...]:
+    return sensor.ColourFilter.kodak(infrared_cut=660 * nm), sensor.Mosaic("RGGB"), sensor.Exposure()
+
+
+def light_of(draw: Draw, size: int) -> Tensor:
+    """1/f noise of any power, of colours of its own, (1, 3, n, n)."""
+    frequencies = torch.hypot(torch.fft.fftfreq(size)[:, None], torch.fft.rfftfreq(size))
+    fall = frequencies.clamp(min=1 / size) ** -draw.number(0, 2)
+    noise = torch.fft.irfft2(torch.fft.rfft2(draw.noise(1, 3, size, size).double()) * fall, s=(size, size))
+    low, high = noise.amin((-1, -2), keepdim=True), noise.amax((-1, -2), keepdim=True)
+    return ((noise - low) / (high - low)).float()
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=24))
+def test_bands_that_are_as_bright_as_each_other(seed: int) -> None:
+    """Each with a texture of its own: their sum shows little of it, and a raw of all bands, or a filter, shows all."""
+    draw = Draw(seed)
+    count, size = draw.one_of(3, 8, 15), draw.one_of(40, 64)
+    cube = 0.3 + 0.4 * torch.rand(1, count, size, size, generator=draw.generator)
+    depth = torch.full((1, 1, size, size), draw.number(0.8, 3))
+    depth[..., size // 2 :, :] = draw.number(0.25, 0.5)
+    wavelengths = torch.linspace(420, 700, count, dtype=torch.float64) * nm
+    lens = optics.Lens(
+        optics.CircularAperture(draw.number(1, 8) * mm), optics.ThinLens(16 * mm), focus_distance=draw.number(0.3, 1)
+    )
+    stages = draw.one_of((), bayer())
+    camera = Camera(optics.Imaging(lens, pixel_pitch=draw.number(5, 12) * um), *stages)
+    check(camera, Scene.from_bands(cube, wavelengths=wavelengths, depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=4, slow=24))
+def test_pixels_with_gaps(seed: int) -> None:
+    draw = Draw(seed)
+    focal = draw.one_of(4.3, 8, 25) * mm
+    plate = optics.ZernikeAberration(60 * nm * torch.randn(8, generator=draw.generator, dtype=torch.float64))
+    lens = optics.Lens(
+        draw.one_of(optics.CircularAperture, optics.SquareAperture)(focal / draw.number(4, 12)),
+        optics.ThinLens(focal),
+        *draw.one_of((), (plate,)),
+        focus_distance=1.0,
+    )
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(3, 12) * um, fill_factor=draw.number(0.08, 0.9))
+    check(Camera(imaging, *bayer()), Scene.builtin("coffee", size=draw.one_of(48, 96)).with_depth(draw.number(0.6, 2)))
+
+
+@pytest.mark.parametrize("fill", [0.1, 0.4, 0.8])
+@pytest.mark.parametrize(
+    "plate", [(), (optics.ZernikeAberration(torch.tensor([0, 0, 0, 0, 8e-8, 3e-8])),)], ids=["table", "lines"]
+)
+def test_transfer_functions_of_pixels_with_gaps_are_those_of_psfs(fill: float, plate: tuple[nn.Module, ...]) -> None:
+    """Both scaled to what whole pixels receive, in windows of any size."""
+    lens = optics.Lens(optics.CircularAperture(0.7 * mm), optics.ThinLens(8 * mm), *plate, focus_distance=1.0)
+    imaging = optics.Imaging(lens, pixel_pitch=(4 if plate else 10) * um, fill_factor=fill)  # else PSFs tell
+    light = Scene.from_rgb(Draw(0).noise(1, 3, 48, 48).float(), depth=1.0)
+    told, asked = transfers.Transfers(imaging, light, (48, 48)), (torch.ones(1).double(), light.wavelengths[::9])
+    with torch.no_grad():
+        for side in (5, 17, 49):
+            own = imaging.changed(psf_shape=(side, side))
+            ways = transfers.Way.LINES, transfers.Way.PSFS
+            found, expected = (told._slices(own, *asked, way, grey=False) for way in ways)
+            near = told.frequencies < 0.35
+            assert float((found - expected)[..., near].abs().max()) < 0.02 + 0.03 * bool(plate)
+            assert float((found / expected - 1)[..., 0].abs().max()) < 0.01 + 0.03 * bool(plate)
+
+
+@pytest.mark.parametrize("seed", some(quick=4, slow=16))
+def test_blur_far_wider_than_the_picture(seed: int) -> None:
+    """Hardly any light falls into it, and of many layers that which is nearest to focus lights most of it."""
+    draw = Draw(seed)
+    focal = draw.one_of(35, 50, 85) * mm
+    coefficients = torch.randn(15, generator=draw.generator, dtype=torch.float64)
+    coefficients[:3] = 0
+    plate = optics.ZernikeAberration(coefficients * draw.number(0.3, 3) * 550 * nm / coefficients.norm())
+    aperture = optics.CircularAperture(focal / draw.number(4, 32))
+    lens = optics.Lens(aperture, optics.ThinLens(focal), *draw.one_of((), (plate,)), focus_distance=draw.number(1, 3))
+    size = draw.one_of(24, 32, 48)
+    depth: Any = draw.number(0.35, 0.8)
+    if draw.one_of(True, False):
+        depth = 1 / torch.linspace(1 / depth, 0.4, size * size).view(1, 1, size, size)
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(1, 3.5) * um)
+    check(Camera(imaging, *draw.one_of((), bayer())), Scene.from_rgb(light_of(draw, size), depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=24))
+def test_pixels_that_see_points_of_what_maps_scatter(seed: int) -> None:
+    draw = Draw(seed)
+    focal = draw.one_of(25, 35, 50) * mm
+    map_ = torch.rand(draw.one_of(4, 8, 16), 1, generator=draw.generator)
+    values = (map_ * torch.rand(1, len(map_), generator=draw.generator)).clamp(min=0.05)
+    width = focal / draw.number(8, 16)
+    element = draw.one_of(optics.ApertureMap(values, width=width), optics.CircularAperture(width))
+    plate = draw.one_of((), (optics.DOE(2 * torch.rand(8, 8, generator=draw.generator)),))
+    lens = optics.Lens(element, optics.ThinLens(focal), *plate, focus_distance=draw.number(0.6, 2))
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(8, 12) * um, integrate=False)
+    check(Camera(imaging, *bayer()), Scene.from_rgb(light_of(draw, 48), depth=draw.number(0.4, 1.5)))
+
+
+# ---- stages of one's own -----------------------------------------------------------------------------------------
+
+
+class Half(optics.Imaging):
+    """Of a user's own, which does more than a plan can know."""
+
+    def forward(self, *arguments: Any, **named: Any) -> Tensor:
+        return super().forward(*arguments, **named).square()
+
+
+def hooked(imaging: optics.Imaging) -> optics.Imaging:
+    imaging.register_forward_hook(lambda _module, _given, light: light.square())
+    return imaging
+
+
+@pytest.mark.parametrize("make", [lambda **how: Half(**how), lambda **how: hooked(optics.Imaging(**how))])
+def test_what_changes_an_imaging_keeps_what_a_user_made_of_it(make: Callable[..., optics.Imaging]) -> None:
+    lens = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(25 * mm), focus_distance=1.0)
+    imaging = make(lens=lens, pixel_pitch=5 * um).eval()
+    changed = imaging.changed(bands=4)
+    assert type(changed) is type(imaging)
+    assert not changed.training
+    assert changed.bands == 4
+    assert imaging.bands is None
+    assert changed.lens is lens
+    check(Camera(imaging), Scene.builtin("coffee", size=32).with_depth(1.4))
+
+
+def test_a_channel_that_sees_none_of_the_light_is_dark() -> None:
+    """Where layers hide each other, too."""
+    lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(50 * mm), focus_distance=1.0)
+    curves = torch.tensor([[0.0, 0, 0.5, 0.5], [0.5, 0.5, 0, 0]])
+    blind = sensor.ColourFilter.from_curves(torch.tensor([400.0, 500, 510, 700]) * nm, curves)
+    depth = torch.full((1, 1, 32, 32), 1.0)
+    depth[..., 16:] = 2.0
+    light = torch.rand(1, 3, 32, 32, generator=Draw(0).generator).requires_grad_()
+    scene = Scene.from_bands(light, wavelengths=torch.tensor([600.0, 620, 640]) * nm, depth=depth)
+    camera = Camera(optics.Imaging(lens, pixel_pitch=4 * um), blind, sensor.Exposure(time=0.01))
+    raw = camera(scene)
+    assert bool(raw.isfinite().all())
+    assert float(raw[:, 0].detach().min()) > 0
+    assert float(raw[:, 1].detach().abs().max()) == 0
+    assert bool(torch.autograd.grad(raw.sum(), light)[0].isfinite().all())
+
+
+def test_what_is_no_scene_and_numbers_of_numpy() -> None:
+    camera, scene = Camera.phone(), Scene.builtin("coffee", size=24)
+    with pytest.raises(TypeError, match="a plan is for scenes, got NoneType"):
+        make_plan(camera, None, tolerance=0.01)  # type: ignore[arg-type]
+    plan = make_plan(camera, scene, tolerance=np.float32(0.02))  # type: ignore[arg-type]
+    assert type(plan.tolerance) is float
+    assert math.isclose(plan.tolerance, 0.02, rel_tol=1e-6)
+    with pytest.raises(TypeError, match="max_memory must be a positive number of bytes, got '1GB'"):
+        make_plan(camera, scene, tolerance=0.01, max_memory="1GB")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="kappa must be a number above 1 sample per fringe, got 'a'"):
+        optics.Accuracy(kappa="a")  # type: ignore[arg-type]
