@@ -24,6 +24,7 @@ from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.planner.ladder import Ladder, Level
 from kcam.planner.spectra import PARAXIAL, Care
 from kcam.planner.survey import RANKS
+from kcam.planner.transfers import GAPS
 from kcam.scene import Scene
 
 FEW_LAYERS, FEWER_LAYERS, MORE_LAYERS, TAIL = 3, 2, 5, 16
@@ -163,7 +164,7 @@ class _View:
         self.computed = isinstance(lens, Lens) or imaging.varies  # else PSFs cost next to nothing
         self.stand_in: dict[str, Any] = {}
         exact = self.row is not None and self.row.physics == EXACT and isinstance(lens, Lens) and lens.has_pixels
-        if exact and not (self.query is not None and self.query.folded()):  # whose points differ between the models
+        if exact and not (self.query is not None and self.query.folded(GAPS)):  # whose points differ between the models
             self.stand_in = PARAXIAL  # no warp, and lines
         self.beside = self.few()
 
@@ -283,12 +284,14 @@ def _precision(view: _View) -> Iterator[Ladder]:
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
-    unsteady = view.evaluator.missed or (view.query is not None and view.query.folded())
-    if unsteady and view.one:
-        return  # it takes all PSFs to know: what few cost falls in no order with their number
     lamps = view.query is not None and view.query.symmetric and view.evaluator.few_lights
     beside = view.few(bands=0, layers=MORE_LAYERS if lamps else None)
-    successive = view.computed and not (unsteady or view.evaluator.tabled(beside))
+    query, tabled = view.query, view.evaluator.tabled(beside)
+    folded = query is not None and (query.folded() or (query.folded(GAPS) and not tabled))
+    unsteady = folded or view.evaluator.missed
+    if unsteady and view.one:
+        return  # it takes all PSFs to know: what few cost falls in no order with their number
+    successive = view.computed and not (unsteady or tabled)
     deep = any(is_deep(scene) for scene in view.evaluator.scenes)
     if successive or deep:
         few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]

@@ -47,7 +47,7 @@ _HARDLY = 0.04  # of the light of a smooth pupil, that a window holds, below whi
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
-_GAPS = 0.95  # of a pixel's width, that is sensitive, up to which light from all directions folds onto slices: errors
+GAPS = 0.95  # of a pixel's width, that is sensitive, up to which light from all directions folds onto slices: errors
 # of optics that are not round were told 0.4 times what they are
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
 
@@ -311,7 +311,7 @@ class Transfers:
 
     def lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Table | None:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
-        if self._widest is not None and self._widest.folded(_GAPS):
+        if self._widest is not None and self._widest.folded(GAPS):
             return None
         window, some = self.window(imaging, vergences), self._every_and(wavelengths)
         lens, bands = (imaging.accuracy.propagator, window), tuple(some.tolist())
