@@ -356,7 +356,8 @@ def _depth(view: _View) -> Iterator[Ladder]:
 def _hiding(view: _View) -> tuple[int, float]:
     """Layers that tell what hides what, and times what they tell there may be."""
     few = view.evaluator.certain and not view.evaluator.few_lights
-    return (HIDING, BY_FEWER) if few else (HIDING_LIGHTS, 1.0)
+    layers, factor = (HIDING, BY_FEWER) if few else (HIDING_LIGHTS, 1.0)
+    return max(layers, view.least_layers), factor
 
 
 def _seams(view: _View, beside: dict[str, Any]) -> Callable[[Level], float]:
