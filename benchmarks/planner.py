@@ -73,9 +73,7 @@ def measure_pair(
                 "tolerance": tolerance,
                 "bound": plan.bound,
                 "expected": plan.expected,
-                "error": max(
-                    relative_rms(a, b) for a, b in [(shot[0][1], truth), *zip(shot[0][1], truth, strict=True)]
-                ),
+                "error": worst(shot[0][1], truth),
                 "checked": plan.checked,
                 "seconds": statistics.median(seconds for seconds, _ in shot),
                 "reference_seconds": statistics.median(references),
@@ -102,7 +100,7 @@ def honest_pair(kind: str, seed: int) -> dict[str, Any]:
         for tolerance in TOLERANCES:
             plan = planner.plan(tolerance)
             raw = noiseless_raw(plan.apply(camera))(scene)
-            error = max(relative_rms(a, b) for a, b in [(raw, truth), *zip(raw, truth, strict=True)])
+            error = worst(raw, truth)
             left_out = [row.effect for row in plan.decisions if row.chosen == "left out"]
             rows.append({"tolerance": tolerance, "bound": plan.bound, "error": error, "left_out": left_out})
     return {"seed": f"{kind} {seed}", "pair": f"{effects}; {text}", "tolerances": rows}
@@ -118,8 +116,8 @@ def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
             found = done[f"{kind} {seed}"] = honest_pair(kind, seed)
             with partial.open("a") as file:
                 file.write(json.dumps(found) + "\n")
-            worst = max(row["error"] / row["tolerance"] for row in found["tolerances"])
-            print(f"{found['seed']}: {found['pair']}: worst {worst:.2f} of the tolerance", flush=True)
+            most = max(row["error"] / row["tolerance"] for row in found["tolerances"])
+            print(f"{found['seed']}: {found['pair']}: worst {most:.2f} of the tolerance", flush=True)
     content: dict[str, Any] = {"environment": measure.environment()}
     for kind, own in seeds.items():
         if not own:
@@ -133,6 +131,11 @@ def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
         }
         print(kind, {name: value for name, value in content[kind].items() if name != "all"})
     measure.write_json(out, content)
+
+
+def worst(raw: Tensor, truth: Tensor) -> float:
+    """Relative RMS of a batch, or of that item in it which is worst."""
+    return max(relative_rms(a, b) for a, b in [(raw, truth), *zip(raw, truth, strict=True)])
 
 
 def _median(seconds: Sequence[float] | None) -> float | None:
@@ -230,10 +233,10 @@ def main() -> None:
             done[key] = measure_pair(kind, seed, rates)
             with partial.open("a") as file:
                 file.write(json.dumps(done[key]) + "\n")
-            worst = max(row["error"] / row["tolerance"] for row in done[key]["tolerances"])
+            most = max(row["error"] / row["tolerance"] for row in done[key]["tolerances"])
             third = done[key]["tolerances"][2]
             gain = third["reference_seconds"] / third["seconds"]
-            text = f"worst {worst:.2f} of the tolerance; {gain:.1f} times as fast at 0.01"
+            text = f"worst {most:.2f} of the tolerance; {gain:.1f} times as fast at 0.01"
             print(f"{key}: {done[key]['pair']}: {text}", flush=True)
     found = {kind: [done[f"{kind} {seed}"] for seed in own] for kind, own in seeds.items()}
     failures = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any, TypedDict
 
 import torch
@@ -21,6 +21,13 @@ from kcam.units import as_numbers, check_distances
 COVERAGES = ("channel", "band")
 OVER_THE_FIELD = ("field_variation", "distortion", "lateral_colour", "relative_illumination")
 """What optics may do that vary over the picture, each of which can be left out by itself."""
+
+
+def check_memory(max_memory: Any) -> None:
+    """ValueError for a memory that is not positive, TypeError for what is no number."""
+    given = as_numbers(max_memory, name="max_memory", expected="a positive number of bytes")
+    if not given > 0:
+        raise ValueError(f"max_memory must be a positive number of bytes, got {given:g}.")
 
 
 @dataclass(frozen=True)
@@ -118,16 +125,15 @@ class Accuracy(Recipe):
         if shape is not None and not (isinstance(shape, Sequence) and len(shape) == 2 and all(map(is_count, shape))):
             fix = f" Use ({shape}, {shape})." if is_count(shape) else ""
             raise ValueError(f"psf_shape must be two positive integers (H, W) in pixels, or None, got {shape!r}.{fix}")
-        if self.kappa is not None and not (isinstance(self.kappa, Real) and self.kappa > 1):
-            given = as_numbers(self.kappa, name="kappa", expected="a number above 1 sample per fringe")
-            raise ValueError(f"kappa must be above 1 sample per fringe, got {given:g}. Its default is {KAPPA:g}.")
+        if self.kappa is not None:
+            kappa = as_numbers(self.kappa, name="kappa", expected="a number above 1 sample per fringe")
+            if not kappa > 1:
+                raise ValueError(f"kappa must be above 1 sample per fringe, got {kappa:g}. Its default is {KAPPA:g}.")
         if self.precision not in (None, "float32", "float64"):
             raise ValueError(
                 f'precision must be "float32", "float64" or None for the scene\'s, got {self.precision!r}.'
             )
-        if not (isinstance(self.max_memory, Real) and self.max_memory > 0):
-            given = as_numbers(self.max_memory, name="max_memory", expected="a positive number of bytes")
-            raise ValueError(f"max_memory must be a positive number of bytes, got {given:g}.")
+        check_memory(self.max_memory)
         own: dict[str, Any] = {"max_memory": float(self.max_memory)}
         own |= {} if self.layers is None else {"layers": _count_or_distances(self.layers)}
         own |= {} if shape is None else {"psf_shape": (int(shape[0]), int(shape[1]))}

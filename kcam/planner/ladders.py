@@ -144,6 +144,7 @@ class _View:
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
         ends = torch.stack([self.vergences.min(), self.vergences.max()])
         self.blur, self.row, self.query, self.few_layers = 0.0, None, None, FEW_LAYERS
+        self.stand_in: dict[str, Any] = {}
         self.rays = torch.zeros(len(scene.wavelengths), dtype=torch.float64)  # of each wavelength, at most [pixels]
         if isinstance(lens := imaging.lens, Lens):
             pixels = imaging.pixels(self.window, planes)
@@ -151,6 +152,9 @@ class _View:
             self.blur = float(query.displacement.max()) + lens.pixel_phase_displacement(query.wavelengths)
             self.rays = query.displacement.cpu() / imaging.pixel_pitch
             self.row = None if imaging.varies else imaging.accuracy.row(query)
+            exact = self.row is not None and self.row.physics == EXACT
+            if exact and lens.has_pixels and not query.folded(GAPS):  # points differ between the models
+                self.stand_in = PARAXIAL  # no warp, and lines
             if query.has_pixel_phase and not imaging.varies and len(evaluator.items) == 1:
                 self.few_layers = FEWER_LAYERS
         elif evaluator.varies:
@@ -162,10 +166,6 @@ class _View:
         self.largest = CROP if any(sample.places for sample in evaluator.samples) else max(scene.shape[1:])
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.computed = isinstance(lens, Lens) or imaging.varies  # else PSFs cost next to nothing
-        self.stand_in: dict[str, Any] = {}
-        exact = self.row is not None and self.row.physics == EXACT and isinstance(lens, Lens) and lens.has_pixels
-        if exact and not (self.query is not None and self.query.folded(GAPS)):  # whose points differ between the models
-            self.stand_in = PARAXIAL  # no warp, and lines
         self.beside = self.few()
 
     @property

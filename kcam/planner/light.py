@@ -65,13 +65,19 @@ def recorded(camera: Camera, scene: Scene) -> Tensor | None:
     return sums if weights is None else sums @ weights
 
 
+def _factors(scene: Scene) -> tuple[Tensor, Tensor]:
+    """The planes of a scene, at least float32, and the spectrum of each, (K, L)."""
+    planes = scene.coefficients.detach()
+    spectra = torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()
+    return planes.to(torch.promote_types(planes.dtype, torch.float32)), spectra
+
+
 def compressed(scene: Scene) -> Scene:
     """The scene as planes of the fewest spectra that leave out `_WHOLE` of its light at most: of its square root, so
     that the rest counts beside a few bright lights, and dim items beside bright ones.
     """
-    planes = scene.coefficients.detach()
-    planes = planes.to(torch.promote_types(planes.dtype, torch.float32))
-    spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).to(planes)
+    planes, spectra = _factors(scene)
+    spectra = spectra.to(planes)
     onto_light = torch.linalg.qr(spectra.T).R  # as long as the radiance
     light = torch.einsum("lk,bkhw->blhw", onto_light, planes).square().sum(1, keepdim=True).sqrt()
     light = light.clamp(min=torch.finfo(planes.dtype).tiny)
@@ -90,9 +96,8 @@ def hues(scene: Scene, weights: Tensor | None) -> Tensor:
     """What is recorded of each pixel in sums of bands (R, L), or in all bands, as the fewest planes (B, J, H, W) whose
     squares add up to it, but for `_PALE` of its contrast: of light that all bands blur alike.
     """
-    planes = scene.coefficients.detach()
-    planes = planes.to(torch.promote_types(planes.dtype, torch.float32))
-    spectra = (torch.eye(planes.shape[1]) if scene.spectra is None else scene.spectra.detach()).double().cpu()
+    planes, spectra = _factors(scene)
+    spectra = spectra.double().cpu()
     sums = spectra if weights is None else spectra @ weights.double().cpu().T  # (K, R)
     flat = planes.flatten(2) / planes.flatten(1).norm(dim=1).clamp(min=torch.finfo(planes.dtype).tiny)[:, None, None]
     grams = (flat @ flat.mT).double().cpu().sum(0)

@@ -16,6 +16,7 @@ import torch
 from kcam.cache import unchanged
 from kcam.camera import Camera
 from kcam.optics import Imaging
+from kcam.optics.accuracy import check_memory
 from kcam.optics.imaging import is_deep
 from kcam.planner import costs
 from kcam.planner.evaluation import Evaluator
@@ -29,7 +30,6 @@ from kcam.planner.skips import Skip, shortcuts_of
 from kcam.scene import Scene
 from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free
-from kcam.units import as_numbers
 
 WORTH, WORTH_DEEP, WORTH_LIGHTS = 0.12, 0.19, 0.7
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, with a map of
@@ -330,9 +330,8 @@ def _check_scenes(scenes: Sequence[Any], max_memory: float | None) -> None:
             raise TypeError(f"a plan is for scenes, got {type(scene).__name__}. Use Scene.from_rgb(image, depth=2.0).")
     if len({tuple(scene.wavelengths.tolist()) for scene in scenes}) > 1:
         raise ValueError("the scenes have different wavelengths. Plan together for those of the same.")
-    if max_memory is not None and not (isinstance(max_memory, Real) and max_memory > 0):
-        given = as_numbers(max_memory, name="max_memory", expected="a positive number of bytes")
-        raise ValueError(f"max_memory must be a positive number of bytes, got {given:g}.")
+    if max_memory is not None:
+        check_memory(max_memory)
 
 
 def check_tolerance(tolerance: Any) -> None:

@@ -95,20 +95,25 @@ class Spectra:
 
     scene: whose light may be of a few wavelengths of those that the optics are for. hidden: of each row, the energy of
     the light that something nearer may hide, of what is recorded, for each share of the pixels that is, (B,); None
-    where that does not count.
+    where that does not count. hues: planes (B, J, H, W) instead of the scene's, whose squares add up.
     """
 
     def __init__(
-        self, optics: Transfers, scene: Scene, weights: Tensor | None, *, hidden: Tensor | None = None
+        self,
+        optics: Transfers,
+        scene: Scene,
+        weights: Tensor | None,
+        *,
+        hidden: Tensor | None = None,
+        hues: Tensor | None = None,
     ) -> None:
         self.optics, self.imaging, self.wavelengths = optics, optics.imaging, optics.wavelengths
-        self.scene, self.weights, self.hidden = scene, weights, hidden
+        self.scene, self.weights, self.hidden, self.hues = scene, weights, hidden, hues
         self.frequencies = optics.frequencies
         groups = alike(scene)
         self.groups = [(rows, scene if len(groups) == 1 else scene.samples(rows.tolist())) for rows in groups]
         self._unlike = torch.ones(len(scene.coefficients), dtype=torch.float64)  # see `compare`
         self._framed = torch.ones_like(self._unlike)  # see `frame`
-        self._hues: Tensor | None = None  # planes instead of the scene's, whose squares add up
         self._layered: dict[tuple[int, Any], _Layered] = {}
         self._known: dict[tuple[Any, ...], Tensor] = {}
         self._energies_known: dict[tuple[Any, ...], Tensor] = {}
@@ -197,15 +202,13 @@ class Spectra:
         much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
         light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=UNSEEN)[None].to(self._light)
         grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
-        found = Spectra(self.optics, grey, None)
-        found._hues = hues(self.scene, self.weights)
-        return found
+        return Spectra(self.optics, grey, None, hues=hues(self.scene, self.weights))
 
     @functools.cached_property
     def _coloured(self) -> Tensor:
         """Times the contrast of grey light, in energy, that there is in its hues, (B,), at least 1."""
-        hues = self._light if self._hues is None else self._hues
-        return (contrast(hues) / contrast(self._light).clamp(min=UNSEEN)).clamp(min=1)
+        own = self._light if self.hues is None else self.hues
+        return (contrast(own) / contrast(self._light).clamp(min=UNSEEN)).clamp(min=1)
 
     @functools.cached_property
     def _light(self) -> Tensor:
@@ -377,10 +380,10 @@ class Spectra:
             imaging = self._cutting(scene, layers)
             planes = imaging.working(scene)
             vergences, shares = imaging.layers_of(scene, planes)
-            if self._hues is not None:
-                planes = self._hues[self.groups[index][0]].to(planes)
+            if self.hues is not None:
+                planes = self.hues[self.groups[index][0]].to(planes)
             planes = planes[:, :, None] if shares is None else planes[:, :, None] * shares[:, None]
-            apart = planes.flatten(1, 2)[:, None] if self._hues is None else planes
+            apart = planes.flatten(1, 2)[:, None] if self.hues is None else planes
             look = functools.partial(cross_spectra, frequencies=self.frequencies, dark=imaging.border == "zero")
             crossed = torch.stack([torch.stack([*map(look, own)]).sum(0) for own in apart])
             self._layered[key] = _Layered(vergences, crossed)
