@@ -1,7 +1,7 @@
 """Whether plans keep their word: random pairs of camera and scene, planned at five tolerances and measured.
 
-    python -m benchmarks.planner [--random 300] [--hard 100] [--adversarial 200] [--assorted 100] [--start 0]
-                                 [--out FILE] [--effects]
+    python -m benchmarks.planner [--random 300] [--hard 100] [--adversarial 200] [--assorted 100] [--strange 200]
+                                 [--start 0] [--out FILE] [--effects]
 
 With --effects the same pairs have one to four effects of a sensor's light drawn into them (glare, motion, crosstalk,
 defects, ...), and only whether plans keep their word is measured.
@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.pairs import LONGEST, adversarial_pair, assorted_pair, hard_pair, random_pair, with_effects
+from benchmarks.pairs import FAMILIES, LONGEST, with_effects
 from kcam import Camera, Scene, measure
 from kcam.planner import Planner, costs, make_plan, noiseless_raw, relative_rms, timed
 from kcam.planner.planner import fresh
@@ -34,8 +34,7 @@ FIRST = (0.03, 0.01)  # tolerances at which the first picture is timed too: a pl
 SEEN, FELT = 0.1, 0.3  # seconds of a reference picture from which on the worst, and the median, of first pictures count
 RESULTS = Path(__file__).parent / "results" / "planner.json"
 EFFECTS = RESULTS.with_name("planner_effects.json")
-COUNTS = {"random": 300, "hard": 100, "adversarial": 200, "assorted": 100}
-PAIRS = {"random": random_pair, "hard": hard_pair, "adversarial": adversarial_pair, "assorted": assorted_pair}
+COUNTS = {"random": 300, "hard": 100, "adversarial": 200, "assorted": 100, "strange": 200}
 TIMED = ("random", "hard")  # of which a first picture is taken, too
 
 
@@ -46,7 +45,7 @@ def measure_pair(
 
     rates: of this machine, as `costs.calibrate` found them. Of some first pictures are taken, too, by turns as well.
     """
-    camera, scene, text, again = PAIRS[kind](seed)
+    camera, scene, text, again = FAMILIES[kind](seed)
     wholes: list[float] = []
     alone, first = ({tolerance: list[float]() for tolerance in FIRST} for _ in range(2))
     with torch.no_grad():
@@ -92,7 +91,7 @@ def measure_pair(
 
 def honest_pair(kind: str, seed: int) -> dict[str, Any]:
     """One pair with effects: for each tolerance the estimate and the truth, the worst of the batch and of its items."""
-    camera, scene, text, _ = PAIRS[kind](seed)
+    camera, scene, text, _ = FAMILIES[kind](seed)
     camera, effects = with_effects(camera, scene, f"{kind}/{seed}")
     rows = []
     with torch.no_grad():
