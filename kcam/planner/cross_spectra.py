@@ -23,9 +23,9 @@ def rings() -> Tensor:
     return torch.cat([torch.zeros(1, dtype=torch.float64), fine, even, corners])
 
 
-def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
+def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool, turned: bool = False) -> Tensor:
     """Cross-spectra of planes (K, H, W), mirrored at the borders, or in the dark: (2, F, K, K) of light that runs along
-    x, and y.
+    x, and y; turned: along the diagonals.
     """
     height, width = planes.shape[-2:]
     if dark:
@@ -34,13 +34,16 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool) -> Tensor:
         found[..., 1 : sides[1] // 2] *= math.sqrt(2)  # each stands for one to the left of the middle, too
     else:
         found = scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho")
-    order, beyond, into = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark)
+    order, beyond, into = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark, turned=turned)
     spectrum = torch.as_tensor(found).flatten(1).index_select(1, order).index_fill_(1, beyond, 0)
     if dark:
         spectrum = torch.view_as_real(spectrum).flatten(1)
     parts = spectrum.unflatten(1, (len(into), -1)).transpose(0, 1)
     sums = torch.zeros(2 * len(frequencies), len(planes), len(planes), dtype=torch.float64)
-    return sums.index_add_(0, into, (parts @ parts.mT).double()).unflatten(0, (2, -1))
+    sums = sums.index_add_(0, into, (parts @ parts.mT).double()).unflatten(0, (2, -1))
+    if turned and not dark:  # what is mirrored runs along both diagonals
+        return (sums[:1] / 2).expand(2, -1, -1, -1)
+    return sums
 
 
 def padded(side: int) -> int:
@@ -50,18 +53,21 @@ def padded(side: int) -> int:
 
 @functools.lru_cache(maxsize=8)
 @torch.inference_mode(False)
-def _in_rings(height: int, width: int, frequencies: tuple[float, ...], *, dark: bool) -> tuple[Tensor, Tensor, Tensor]:
+def _in_rings(
+    height: int, width: int, frequencies: tuple[float, ...], *, dark: bool, turned: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     """The order in which a spectrum's frequencies lie in rings, first of light that runs along x, then along y, in
     parts of `_PART`, the last of a ring filled up; which of them fill up; and the ring of each part.
     """
     if dark:
-        fy = torch.fft.fftfreq(padded(height), dtype=torch.float64).abs()
+        fy = torch.fft.fftfreq(padded(height), dtype=torch.float64)
         fx = torch.fft.rfftfreq(padded(width), dtype=torch.float64)
     else:
         fy, fx = (torch.arange(n, dtype=torch.float64) / (2 * n) for n in (height, width))
     middles = torch.tensor(frequencies, dtype=torch.float64)
     ring = torch.bucketize(torch.hypot(fy[:, None], fx).flatten(), (middles[1:] + middles[:-1]) / 2)
-    label = ring + len(frequencies) * (fy[:, None] > fx).flatten()
+    second = (fy[:, None] < 0).expand(-1, len(fx)) if turned else fy.abs()[:, None] > fx
+    label = ring + len(frequencies) * second.flatten()
     counts = label.bincount(minlength=2 * len(frequencies))  # the widest waves of a small picture are few
     parts = -(-counts // _PART)
     into = torch.arange(len(counts)).repeat_interleave(parts)

@@ -10,14 +10,16 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from draws import Draw
 
 from kcam import optics
 from kcam.optics import PROPAGATORS
-from kcam.optics.propagation.estimates import beyond_paraxial, trace
+from kcam.optics.propagation.estimates import beyond_paraxial, is_oblique, trace
 from kcam.optics.propagation.grid import samples_by_rule
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.reference import _evaluate, _refined, convergence
 from kcam.optics.propagation.spectrum import spectrum_grids
+from kcam.optics.source import PixelGrid, Points
 from kcam.units import mm, nm, um
 
 FLOOR = 1e-6  # of float32: below it an estimate may be as much too small as it likes
@@ -276,3 +278,22 @@ def test_rays_go_where_their_slope_says(aperture: optics.Element) -> None:
         query = lens.query([550 * nm], distances=distance, pixel_pitch=4 * um, shape=(65, 65)).modelled(paraxial=True)
         expected = corner * 2 * mm * float(query.sensor_distance) * abs(1 / distance - 1 / 2.0)
         assert float(query.displacement) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_where_defocus_shows_along_the_diagonals(seed: int) -> None:
+    """A pupil's path and a map of pixels with it say the same; turned by an eighth they say the other."""
+    draw = Draw(seed)
+    power, focus = draw.number(6, 20) * draw.one_of(-1, 1), draw.number(-0.3, 0.3)
+    coma = draw.number(-2, 2)
+    axis = torch.linspace(-1, 1, 95, dtype=torch.float64)[1::2]  # middles of pixels
+    x, y = axis, axis[:, None]
+    phases = {True: power * x * y, False: power * (x**2 - y**2) / 2}
+    for oblique, index in ((True, 4), (False, 5)):
+        coefficients = torch.zeros(9, dtype=torch.float64)
+        coefficients[index], coefficients[7] = power / (2 * math.pi) * 550 * nm / (2 * math.sqrt(6)), coma * 20 * nm
+        for plate in (optics.ZernikeAberration(coefficients), optics.DOE(phases[oblique])):
+            lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(25 * mm), plate, focus_distance=1.0)
+            vergences = torch.tensor([1 + focus - 0.2, 1 + focus + 0.2], dtype=torch.float64)
+            wavelengths = torch.tensor([550 * nm], dtype=torch.float64)
+            assert is_oblique(lens.question(Points(vergences), wavelengths, PixelGrid(3 * um, (65, 65)))) == oblique

@@ -47,13 +47,16 @@ def random_question(seed: int, kind: str) -> Query:
     return lens.question(Points(vergences), wavelengths, pixels)
 
 
-def slices(psfs: Tensor) -> Tensor:
-    """Of the transfer functions of PSFs (Z, L, h, w) along x and y, and on from 0.5 along the edge, (Z, L, 2, F)."""
+def slices(psfs: Tensor, *, turned: bool = False) -> Tensor:
+    """Of the transfer functions of PSFs (Z, L, h, w) along x and y, and on from 0.5 along the edge, (Z, L, 2, F);
+    turned: along the diagonals.
+    """
     along = FREQUENCIES.clamp(max=0.5)
     across = (FREQUENCIES.square() - along.square()).clamp(min=0).sqrt()
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in psfs.shape[-2:])
     found = []
-    for fx, fy in ((along, across), (across, along)):
+    slanted = FREQUENCIES * math.sqrt(0.5)
+    for fx, fy in ((slanted, slanted), (-slanted, slanted)) if turned else ((along, across), (across, along)):
         waves = torch.exp(-2j * math.pi * (y[:, None, None] * fy + x[:, None] * fx))
         found.append(torch.einsum("zlyx,yxf->zlf", psfs.to(waves), waves))
     return torch.stack(found, dim=2)
@@ -63,13 +66,13 @@ def norm(values: Tensor) -> float:
     return float(values.abs().square().mean().sqrt())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "turned"), [*((kind, False) for kind in KINDS), ("zernike", True), ("ring", True)])
 @pytest.mark.parametrize("seed", [*range(2), *(pytest.param(n, marks=pytest.mark.slow) for n in range(2, 12))])
-def test_lines_tell_what_wavelengths_and_distances_change(kind: str, seed: int) -> None:
-    query, row = random_question(seed, kind), MATRIX
+def test_lines_tell_what_wavelengths_and_distances_change(kind: str, turned: bool, seed: int) -> None:
+    query, row = dataclasses.replace(random_question(seed, kind), turned=turned), MATRIX
     told = row.lines(query)
     assert told is not None
-    found, expected = told(FREQUENCIES, query.shape, range(3)), slices(row(query))
+    found, expected = told(FREQUENCIES, query.shape, range(3)), slices(row(query), turned=turned)
     assert found.shape == expected.shape == (2, 3, 2, 40)
     assert norm(found - expected) < 0.03
     for ours, theirs in (

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from kcam.optics.propagation.cells import sizes
 from kcam.optics.propagation.question import Query, radial_phase, residual_path
@@ -21,6 +22,8 @@ from kcam.optics.pupil.rim import FINE, edge_response
 from kcam.optics.source import Points
 
 _SIDE = 65  # of the grid on which rays are traced
+_COARSE = 17  # of that on which their second order is looked at
+_TURNED, _COHERENT = 2.0, 0.2  # c from which on a phase is oblique [rad], and of the energy of all slopes
 _NEAR = 1e-5  # of the semi-aperture: the step over which a slope is taken
 _RADII = 96  # of the window over which errors are summed
 _QUANTILES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.0)  # of the rim's displacements
@@ -103,6 +106,47 @@ def beyond_paraxial(query: Query) -> float:
         mean = (weights * left_out).sum(-1, keepdim=True)
         rms = (weights * (left_out - mean).square()).sum(-1).sqrt().max()
         return 2 * math.pi * float(rms / exact.wavelengths[0])
+
+
+def is_oblique(query: Query) -> bool:
+    """Whether a change of focus shows along the diagonals more than along x and y, of optics that are astigmatic.
+
+    A phase of m (u^2 + v^2) / 2 + q (u^2 - v^2) / 2 + c u v spreads light by m + q and m - q along x and y, and by
+    m + c and m - c along the diagonals. Between the outermost distances, at the shortest wavelength, if that is much of
+    what the elements do.
+    """
+    if query.symmetric:
+        return False
+    with torch.no_grad():
+        query = replace(query, wavelengths=query.wavelengths.min()[None].to(query.device))
+        side = torch.linspace(-1, 1, _COARSE, dtype=torch.float64, device=query.device)
+        coefficients, maps = residual_path(query, query.pupil(*from_image_side(side, side[:, None], query.tau)))
+        phases = torch.einsum("zt,tvu->zvu", 2 * math.pi / query.wavelengths * coefficients[0], maps)
+        down, across = torch.gradient(phases, spacing=float(side[1] - side[0]), dim=(-2, -1))
+        found = _second_order(query, down, across, side)
+        for pixels in query.lens.pixel_maps(query.wavelengths):
+            if pixels.factors is None or (count := len(pixels.values)) < 3:
+                continue
+            share = 1.0 if pixels.half_width is None else float(pixels.half_width / query.semi_aperture)
+            corners = (torch.arange(1, count).to(side) * (2 / count) - 1) * share
+            down, across = (step * (count / (2 * share)) for step in pixels.steps())
+            down, across = (down[:, 1:] + down[:, :-1]) / 2, (across[1:] + across[:-1]) / 2
+            found = found + _second_order(query, down, across, corners)
+        (low, high), (_, q, c, energy) = found[0].aminmax(), found.amin(1)
+        focus = (low**2 + low * high + high**2) / 3  # in the mean over distances in between
+        return bool((c.abs() > _TURNED) & (c**2 > focus + 2 * q**2) & (c**2 > _COHERENT * energy))
+
+
+def _second_order(query: Query, down: Tensor, across: Tensor, side: Tensor) -> Tensor:
+    """m, q and c of a phase with slopes (..., N, N) at places (N,), see `is_oblique`, and what c^2 would be if all of
+    its slopes were of it: (4, Z or 1).
+    """
+    u, v = side, side[:, None]
+    r2 = u**2 + v**2
+    weights = (r2 <= 1) if query.lens.round else torch.maximum(u.abs(), v.abs()) <= 1
+    weights = weights / (weights * r2).sum()
+    parts = across * u + down * v, across * u - down * v, across * v + down * u, across**2 + down**2
+    return torch.stack([(weights * part).sum((-2, -1)) for part in parts]).view(4, -1)
 
 
 def grid_error(query: Query, rays: Rays, *, period: float) -> float:

@@ -1,4 +1,4 @@
-"""Transfer functions along x and y straight from the pupil, for estimates: no PSF is computed.
+"""Transfer functions along x and y, or the diagonals, straight from the pupil, for estimates: no PSF is computed.
 
     LSF(x) = INT |U(x, y)|^2 dy ~ INT |F_u P(u, v)|^2 dv        (Parseval along v)
 
@@ -109,9 +109,9 @@ class LineTransfer:
 
     def _folded(self, frequencies: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if self._folds is None or self._folds[0] is not frequencies:
-            grid = self.query.grid
-            active = grid.active if grid.integrate else 0.0
-            found = sampling.folded(frequencies.to(grid.device, torch.float64), self._cutoff, active)
+            grid, turned = self.query.grid, self.query.turned
+            active, own = grid.active if grid.integrate else 0.0, frequencies.to(grid.device, torch.float64)
+            found = sampling.folded(own, self._cutoff, active, turned=turned)
             self._folds = frequencies, found
         return self._folds[1]
 
@@ -416,8 +416,11 @@ def _middles(edges: Tensor, parts: int) -> Tensor:
 
 
 def _pupil(query: Query, along: Tensor, across: Tensor, axis: int) -> Pupil:
-    """Of rows along x (axis 0), or columns along y (axis 1)."""
-    return query.pupil(*from_image_side(*((across, along) if axis else (along, across)), query.tau))
+    """Of rows along x (axis 0), or columns along y (axis 1), or along the diagonals."""
+    x, y = (across, along) if axis else (along, across)
+    if query.turned:
+        x, y = (x - y) * math.sqrt(0.5), (x + y) * math.sqrt(0.5)
+    return query.pupil(*from_image_side(x, y, query.tau))
 
 
 def _rim(query: Query, rows: Tensor, nodes: Tensor) -> Tensor:

@@ -55,7 +55,7 @@ class Query:
 
     wavelengths: (L,) float64 [m]. points: whose vergences are on the grid's device. grid: the pixels.
     how: closely it is answered. paraxial: by the model of a row. whole: scaled to what whole pixels receive together,
-    see `Pixels`.
+    see `Pixels`. turned: where slices are asked for, along the diagonals, of smooth round pupils.
     """
 
     lens: ElementStack
@@ -65,6 +65,7 @@ class Query:
     how: Sampling = Sampling()
     paraxial: bool = False
     whole: bool = False
+    turned: bool = False
 
     def on(self, **grid: Any) -> Query:
         """The same question of other pixels; arguments: as of `PixelGrid`."""

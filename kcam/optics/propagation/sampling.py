@@ -93,10 +93,13 @@ def pixel_box(pixels: int, *, per_pixel: float, reach: int, active: float = 1.0)
     return torch.as_tensor(np.ascontiguousarray(box))
 
 
-def along_axis(frequencies: Tensor) -> tuple[Tensor, Tensor]:
+def along_axis(frequencies: Tensor, *, turned: bool = False) -> tuple[Tensor, Tensor]:
     """Where a slice of a transfer function along an axis lies, (along, across) it [cycles per pixel]: from 0.5 on, as
-    light along the axis is an alias there, on the edge of the pixels' own frequencies, up to its corner.
+    light along the axis is an alias there, on the edge of the pixels' own frequencies, up to its corner. Turned: along
+    a diagonal.
     """
+    if turned:
+        return frequencies * math.sqrt(0.5), frequencies * math.sqrt(0.5)
     along = frequencies.clamp(max=0.5)
     return along, (frequencies.square() - along.square()).clamp(max=0.25).sqrt()
 
@@ -109,14 +112,16 @@ def of_whole_pixels(found: Tensor, alone: Tensor) -> Tensor:
     return found * (alone / light.clamp(min=1e-30))
 
 
-def folded(frequencies: Tensor, cutoff: float, active: float) -> tuple[Tensor, Tensor, Tensor]:
+def folded(
+    frequencies: Tensor, cutoff: float, active: float, *, turned: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Light up to a cutoff, 2 a / (lambda d) [cycles per pixel], that pixels of an active width fold into frequencies
     along an axis (F,), see `along_axis`: into which of them, (N,); its own frequency, below 0 on the other side of the
     axis; and what pixels record of it.
     """
     most = min(max(1, math.floor(cutoff + 0.5)), _MOST_FOLDS)
     folds = torch.arange(-most, most + 1).to(frequencies)
-    along, across = (part[:, None, None] for part in along_axis(frequencies))
+    along, across = (part[:, None, None] for part in along_axis(frequencies, turned=turned))
     along, across = (along + folds[:, None]).expand(-1, -1, len(folds)), across + folds
     radius, weights = torch.hypot(along, across), torch.sinc(along * active) * torch.sinc(across * active)
     seen = (radius < cutoff + _SEEN) & (weights.abs() > _SEEN)  # pixels without gaps fold nothing across the axis
