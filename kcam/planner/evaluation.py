@@ -230,15 +230,44 @@ class Evaluator:
         By spectra light beyond the full well counts too, so that they say at least as much.
         """
         if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
-            sharp = changes.get("blur") is False is against.get("blur")
-            beside = self._dimming * max(self.lost.values(), default=1.0) if sharp and self.certain else 1.0
-            return beside * _error(self.samples, self.answers(changes), self.answers(against))
+            tried = _error(self.samples, self.answers(changes), self.answers(against))
+            if not (changes.get("blur") is False is against.get("blur") and self.certain):
+                return tried
+            unseen = self._apart * self._unseen(changes["rank"]) if "rank" in changes else 0.0
+            return self._dimming * max(self.lost.values(), default=1.0) * math.hypot(tried, unseen)
         if changes.get("occlusion") != against.get("occlusion"):
             return self._hidden(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
             found += self._relative(sample, torch.stack(spectra.energies(changes, against, care)))
         return max(found)
+
+    def _unseen(self, rank: int) -> float:
+        """RMS of what so few spectra leave out of all bands, relative to what is recorded: pixels see less of it, as
+        long as light of all bands is blurred alike.
+        """
+        found = [0.0]
+        for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
+            bands = sample.scene.bands()
+            off = (sample.scene.low_rank(rank).bands() - bands).square().sum((2, 3)).double().cpu()
+            weights = torch.eye(bands.shape[1]) if spectra.weights is None else spectra.weights
+            seen = torch.einsum("rl,blhw->brhw", weights.to(bands), bands).square().sum((1, 2, 3)).double().cpu()
+            for rows, factor in sample.of_owners():
+                power = float((off[rows] @ weights.double().square().sum(0)).sum())
+                found.append(factor * math.sqrt(power / max(float(seen[rows].sum()), 1e-300)))
+        return max(found)
+
+    @functools.cached_property
+    def _apart(self) -> float:
+        """How far apart PSFs of the wavelengths are, relative to the contrast of what is seen, at most 1."""
+        told = {name: value for name, value in self._looked.items() if name in LINEAR - {"kappa"}}
+        if not self.missed:
+            told.pop("bands", None)
+        found = [0.0]
+        for spectra in self.spectra or ():
+            off, all_of_it = spectra.energies({**told, "bands": 1}, told)
+            found += (off / (all_of_it * spectra.contrast).clamp(min=1e-300)).sqrt().tolist()
+        return min(1.0, max(found))
 
     @functools.cached_property
     def _dimming(self) -> float:

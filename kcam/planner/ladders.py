@@ -22,9 +22,9 @@ from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
 from kcam.planner.ladder import Ladder, Level
-from kcam.planner.spectra import PARAXIAL, Care
+from kcam.planner.spectra import Care
 from kcam.planner.survey import RANKS
-from kcam.planner.transfers import GAPS
+from kcam.planner.transfers import GAPS, PARAXIAL
 from kcam.scene import Scene
 
 FEW_LAYERS, FEWER_LAYERS, MORE_LAYERS, TAIL = 3, 2, 5, 16
@@ -107,6 +107,9 @@ CANCELLED = {torch.float32: 2e-5, torch.float64: 1e-13}
 ROUNDED = {torch.float32: 2e-6, torch.float64: 1e-15}
 """By which two ways to the same picture differ."""
 
+SINGLE = 6e-6
+"""What pictures in float32 are said to err at least: of few wavelengths and layers 2.4e-6 was told, of all 4.4e-6."""
+
 WINDOWS = (5, 9, 17, 33, 65, 129, 257, 513)  # sides of those of PSFs that may stand for the whole [pixels]
 UNRECORDED, FARTHER = 1e-3, 1.2  # RMS of light of a wavelength, of that of all, of which windows may cut off what they
 # like; how much farther rays may go at others than at those that tell of a window
@@ -125,7 +128,10 @@ def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[La
         return []
     view = _View(evaluator, imaging, scene, one=one)
     evaluator.look(view.beside | view.coarse)
-    found = [ladder for make in LADDERS for ladder in make(view)]
+    if evaluator.missed:  # which is known now
+        view = _View(evaluator, imaging, scene, one=one)
+    make_ladders = (_blur,) if evaluator.missed and one else LADDERS  # what takes PSFs to know does not pay
+    found = [ladder for make in make_ladders for ladder in make(view)]
     for ladder in found:
         ladder.least = max(ladder.least, ROUNDED[view.dtype])
     return found
@@ -153,7 +159,8 @@ class _View:
             self.rays = query.displacement.cpu() / imaging.pixel_pitch
             self.row = None if imaging.varies else imaging.accuracy.row(query)
             exact = self.row is not None and self.row.physics == EXACT
-            if exact and lens.has_pixels and not query.folded(GAPS):  # points differ between the models
+            alike = not (query.folded(GAPS) or evaluator.missed)  # points, and what is left of light, are not
+            if exact and lens.has_pixels and alike:
                 self.stand_in = PARAXIAL  # no warp, and lines
             if query.has_pixel_phase and not imaging.varies and len(evaluator.items) == 1:
                 self.few_layers = FEWER_LAYERS
@@ -233,7 +240,7 @@ def _blur(view: _View) -> Iterator[Ladder]:
     levels = [Level("none", {"blur": False}), Level(label, {})]
     if view.trained:
         levels = levels[1:]  # a parameter of the lens that trains acts through it
-    yield Ladder("diffraction", levels, view.beside, blurs=False)
+    yield Ladder("diffraction", levels, view.beside, blurs=False, surely={"bands": None})
 
 
 def _model(view: _View) -> Iterator[Ladder]:
@@ -279,7 +286,7 @@ def _precision(view: _View) -> Iterator[Ladder]:
     precision = view.imaging.accuracy.precision
     if precision == "float64" or (precision is None and view.scene.dtype == torch.float64):
         levels = [Level("float32", {"precision": "float32"}), Level("float64", {})]
-        yield Ladder("precision", levels, view.beside, doubtful=True)
+        yield Ladder("precision", levels, view.beside, doubtful=True, least=SINGLE)
 
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
@@ -380,12 +387,12 @@ def _support(view: _View) -> Iterator[Ladder]:
         changes = {"psf_shape": shape} | ({"renormalise": True} if renormalise else {})
         return Level(f"{shape[0]} x {shape[1]} px" + (", rescaled" if renormalise else ""), changes, side)
 
+    missed = view.evaluator.missed  # then each wavelength has its own of what falls into the window
     by_lines = view.evaluator.by_lines(view.beside)
     tabled = not by_lines and view.evaluator.tabled(view.beside)
     pixels = by_lines and view.query is not None and view.query.has_pixel_phase
-    beside = view.few(
-        bands=FEW_BANDS if by_lines else ROUND, layers=view.few_layers if pixels else FEW_LAYERS, window=False
-    )
+    bands = 0 if missed else FEW_BANDS if by_lines else ROUND
+    beside = view.few(bands=bands, layers=view.few_layers if pixels else FEW_LAYERS, window=False)
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
     core = tabled and view.evaluator.few_lights  # of which little may count that is far, as beyond wrapped profiles
     least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one and not core else 0.0
@@ -402,7 +409,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
     if pixels:
         ladder.off_by, ladder.rough, ladder.little = BY_LINES_OF_PIXELS, Care.AT_FIRST, math.inf
-    elif by_lines:
+    elif by_lines and view.imaging.fill_factor == 1:  # else lines do not tell what colours of aliases cost
         ladder.off_by = BY_LINES
     yield ladder
 

@@ -32,7 +32,7 @@ from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.cross_spectra import cross_spectra
 from kcam.planner.light import UNSEEN, blurred, compressed, contrast, few_lights, hues, lights, recorded
-from kcam.planner.transfers import GROUPS, Transfers, Way
+from kcam.planner.transfers import GROUPS, PARAXIAL, Transfers, Way
 from kcam.scene import Scene
 
 LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
@@ -45,11 +45,11 @@ COLOURS = {"bands", "interpolate_bands"}
 WITH_PSFS = {"psf_shape", "renormalise", "kappa", "propagator"}
 """Of these, those whose error is that of the PSFs themselves, not of what they are computed for."""
 
-PARAXIAL = {"propagator": "fresnel"}
-"""The model that leaves out what spheres have beyond their parabolas, as changes of an Imaging."""
-
 WINDOW = {"psf_shape", "renormalise"}
 """Of those, those of the window alone."""
+
+WHOLE = {"renormalise": True}
+"""What masks are always blurred with: each covers as much as there is of it."""
 
 TOLD_BY_LINES = WINDOW | {"propagator"}
 """These and others that line spreads tell roughly."""
@@ -64,6 +64,9 @@ _WIDE = 1 / 8  # of the picture's shorter side, the radius of such a blur
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
 _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
+_UNLIKE_LAYERS = 0.75  # of the light that falls into the window from a layer, that does not from another, from which on
+# they are not, and veil what is behind: wavelengths before 40 such scenes were told 1.1 times the truth and more
+_MOST_VEILED = 0.9  # of what is behind
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
 _GOES_ON = 1.5  # times the energy that mirrors would give, of a picture whose borders are replicated
 _OUTSIDE = 1.4  # times what products of line spreads say is lost beyond borders: 0.9 to 1.6 of 13 that lose 3 %
@@ -75,7 +78,7 @@ _SAME_LAYER = 1e-6  # of the range of depth
 @dataclass(frozen=True)
 class _Layered:
     """Of rows that are cut into the same layers: their vergences (Z,), and cross-spectra (B, 2, F, K Z, K Z) of light
-    that runs along x, and y.
+    that runs along x, and y, or the diagonals.
     """
 
     vergences: Tensor
@@ -208,7 +211,12 @@ class Spectra:
     def _coloured(self) -> Tensor:
         """Times the contrast of grey light, in energy, that there is in its hues, (B,), at least 1."""
         own = self._light if self.hues is None else self.hues
-        return (contrast(own) / contrast(self._light).clamp(min=UNSEEN)).clamp(min=1)
+        return (contrast(own) / self.contrast.clamp(min=UNSEEN)).clamp(min=1)
+
+    @functools.cached_property
+    def contrast(self) -> Tensor:
+        """What differs from its mean, of the energy of what is recorded in all bands, (B,)."""
+        return contrast(self._light)
 
     @functools.cached_property
     def _light(self) -> Tensor:
@@ -285,18 +293,34 @@ class Spectra:
         if care is not Care.FULL and not _differ(changes, against, WINDOW):
             changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
-            off, all_of_it = self._linear(changes, against, care)
+            colours = not _differ(changes, against, LINEAR - COLOURS)
+            replaced = torch.where(self.few_lights & colours, _HIDDEN_LIGHTS, self._replaced)
+            off, all_of_it = self._linear(changes, against, care, replaced)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
-            drowned = (self.hidden - _DROWNED).clamp(0, 1)
-            if not _differ(changes, against, LINEAR - COLOURS):
-                return off * (1 + _COLOURED * drowned), all_of_it
-            hiding, even = self._masks._linear(changes, against, care)
-            said = (_EDGES + drowned).clamp(max=1) * self.hidden * hiding / even.clamp(min=1e-300)
-            return off + said * all_of_it, all_of_it
-        off, all_of_it = self.grey._linear({**changes, "bands": None}, {**against, "bands": None})
+            if colours:
+                off = off * (1 + _COLOURED * _drowned(self.hidden))
+            return off + self._by_masks(changes, against, care, self.hidden) * all_of_it, all_of_it
+        every, grey = {"bands": None}, self.grey
+        off, all_of_it = grey._linear({**changes, **every}, {**against, **every}, Care.FULL, grey._replaced)
         laid_over = self._hides and changes.get("layers") != 1  # one plane hides nothing
         return off * torch.where(self.few_lights & laid_over, _OVER_LIGHTS**2, 1.0), all_of_it
+
+    def _by_masks(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care, hidden: Tensor) -> Tensor:
+        """The energy by which what is hidden is off as masks are, of all that there is, (B,): `_EDGES` of it, more
+        where much is hidden, and all of it where light of some layers does not fall into the window, which is where
+        masks have colours.
+        """
+        unlike, colours = self.optics.unlike, not _differ(changes, against, LINEAR - COLOURS)
+        if colours and unlike < _UNLIKE_LAYERS:
+            return torch.zeros_like(hidden)
+        of_masks = {**changes, **WHOLE}, {**against, **WHOLE}
+        off, even = self._masks._linear(*of_masks, care, torch.full_like(hidden, _HIDDEN))
+        share = torch.full_like(hidden, unlike)
+        if not colours:
+            share = (_EDGES + _drowned(hidden) + unlike).clamp(max=1)
+        said = share * hidden * off / even.clamp(min=1e-300)
+        return said if unlike < _UNLIKE_LAYERS else said / (1 - self._veiled) ** 2
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
         """The same of some rows, and of what hides what: tried out."""
@@ -308,18 +332,11 @@ class Spectra:
         return off, theirs.square().sum((1, 2, 3))
 
     def _linear(
-        self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care, replaced: Tensor
     ) -> tuple[Tensor, Tensor]:
+        """As `energies`; replaced: times the error without occlusion that there is with it, (B,)."""
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        by_psfs = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
-        if by_psfs or (_differ(changes, against, COLOURS) and self.optics.missed):
-            way = Way.PSFS
-        elif care is Care.AT_FIRST:
-            way = Way.WHOLE_LINES
-        elif _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= GROUPS:
-            way = Way.BETWEEN_LINES
-        else:
-            way = Way.LINES
+        way = self._way(changes, against, care)
         # layers lie between others, and windows cut the same off all of them: 1.0 to 1.2 times the truth, measured
         corners = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
         factor, colours = torch.tensor(corners, dtype=torch.float64), not _differ(changes, against, LINEAR - COLOURS)
@@ -338,9 +355,27 @@ class Spectra:
                 least = self.optics.untold(self.optics.stage(against), layered.vergences, self.wavelengths)
                 found[0, rows] = found[0, rows].maximum(least**2 * found[1, rows])
             if len(layered.vergences) > 1 and self._hides:
-                replaced = torch.where(self.few_lights & colours, _HIDDEN_LIGHTS, self._replaced)
                 found[0, rows] *= replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]
+
+    def _way(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> Way:
+        """How transfer functions are found that tell of changes."""
+        by_psfs = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
+        if by_psfs or (_differ(changes, against, COLOURS | {"layers"}) and self.optics.missed):
+            return Way.PSFS
+        if care is Care.AT_FIRST:
+            return Way.WHOLE_LINES
+        if _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= GROUPS:
+            return Way.BETWEEN_LINES
+        return Way.LINES
+
+    @functools.cached_property
+    def _veiled(self) -> Tensor:
+        """Of what lies farther, about how much something nearer covers everywhere that is blurred far wider, (B,)."""
+        ends, light = self.optics.ends, self.optics.passed.mean(1)
+        vergence = 1 / torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
+        near = (vergence > ends.mean()).double().flatten(1).mean(1) if vergence.ndim > 1 else torch.zeros(1)
+        return (near * float(light[-1] < light[0])).clamp(max=_MOST_VEILED).expand(len(self.scene.coefficients))
 
     @functools.cached_property
     def _alone(self) -> Tensor:
@@ -384,7 +419,12 @@ class Spectra:
                 planes = self.hues[self.groups[index][0]].to(planes)
             planes = planes[:, :, None] if shares is None else planes[:, :, None] * shares[:, None]
             apart = planes.flatten(1, 2)[:, None] if self.hues is None else planes
-            look = functools.partial(cross_spectra, frequencies=self.frequencies, dark=imaging.border == "zero")
+            look = functools.partial(
+                cross_spectra,
+                frequencies=self.frequencies,
+                dark=imaging.border == "zero",
+                turned=self.optics.turned,
+            )
             crossed = torch.stack([torch.stack([*map(look, own)]).sum(0) for own in apart])
             self._layered[key] = _Layered(vergences, crossed)
         return self._layered[key]
@@ -443,6 +483,11 @@ class Spectra:
     def _hides(self) -> bool:
         """Whether one part of the scene may hide another."""
         return self.imaging.accuracy.occlusion and is_deep(self.scene)
+
+
+def _drowned(hidden: Tensor) -> Tensor:
+    """How much more is hidden than masks say at edges alone, 0 to 1, (B,)."""
+    return (hidden - _DROWNED).clamp(0, 1)
 
 
 def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:

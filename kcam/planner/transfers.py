@@ -1,5 +1,5 @@
 """What the optics of a stage do to light in rings of frequency, for estimates: slices of transfer functions along x and
-y, from tables or line spreads where there are any, else from PSFs; each is computed once.
+y, or the diagonals, from tables or line spreads where there are any, else from PSFs; each is computed once.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from kcam.optics import Imaging, Lens
 from kcam.optics.imaging import is_deep
 from kcam.optics.numerics import cubic_weights
-from kcam.optics.propagation.estimates import beyond_paraxial
+from kcam.optics.propagation.estimates import beyond_paraxial, is_oblique
 from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.propagation.sampling import along_axis
@@ -26,6 +26,9 @@ from kcam.optics.source import Defocus, Points
 from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
+
+PARAXIAL = {"propagator": "fresnel"}
+"""The model that leaves out what spheres have beyond their parabolas, as changes of an Imaging."""
 
 _BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
 _ASKED = 4  # PSFs, up to how many a choice of wavelengths is mostly asked about: their line spreads are known as well,
@@ -42,8 +45,8 @@ _BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others:
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
 # what models differ in; else it holds more or less by this times (a / d)^2: 0.4 to 1.3 times what 53 maps of pixels do
-_HARDLY = 0.04  # of the light of a smooth pupil, that a window holds, below which line spreads do not tell what is in
-# it: 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses
+_HARDLY, _HARDLY_PIXELS = 0.04, 0.02  # of the light from a distance, that a window holds, below which line spreads do
+# not tell what is in it, 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses; the same of phases of pixels
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -89,7 +92,7 @@ class Transfers:
         self.deep, self.frequencies = is_deep(scene), rings()
         self._like = imaging.working(scene)[:, :0]
         vergences = (1 / torch.as_tensor(scene.depth, dtype=torch.float64)).flatten().cpu()
-        self._ends = torch.stack([vergences.min(), vergences.max()])  # the farthest and the nearest
+        self.ends = torch.stack([vergences.min(), vergences.max()])  # the farthest and the nearest
         self._stages: dict[Any, Imaging] = {}  # by changes
         self._tabled: dict[Any, bool] = {}  # by propagator
         self._windows: dict[Any, tuple[int, int]] = {}  # by what a stage says of them, and vergences
@@ -143,8 +146,9 @@ class Transfers:
         return self._unions[key]
 
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
-        """Slices along x and y at G wavelengths, (Z, G, 2, F), and what each gives to each band of light of wavelengths
-        (L,), (L, G). Of line spreads, of which each takes its time, those of all bands may lie between some.
+        """Slices along x and y, or both diagonals, at G wavelengths, (Z, G, 2, F), and what each gives to each band of
+        light of wavelengths (L,), (L, G). Of line spreads, of which each takes its time, those of all bands may lie
+        between some.
         """
         groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
         shares = imaging.shares(wavelengths, deep=self.deep)
@@ -182,6 +186,8 @@ class Transfers:
     def _of_psfs(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
         pixels = imaging.pixels(window, self._like)
         bank = imaging.bank(Points(vergences), wavelengths, pixels)
+        if self.turned:
+            return _along_diagonals(bank, self.frequencies)
         along, across = along_axis(self.frequencies)
         axis, slices = along < 0.5, []
         sums = []  # over x, and over y: of every other pixel, the middle one among the first
@@ -206,6 +212,11 @@ class Transfers:
         return self._widest is None or _inside(self._widest)
 
     @functools.cached_property
+    def turned(self) -> bool:
+        """Whether slices are along the diagonals: those along x and y would not see what depth changes."""
+        return self.deep and self._widest is not None and is_oblique(self._widest)
+
+    @functools.cached_property
     def folded_across(self) -> bool:
         """Whether light finer than the pixels counts in all directions, of pixels that do not integrate: slices
         straight from the pupil tell of what is folded along them.
@@ -221,11 +232,32 @@ class Transfers:
         return _CUT_ROUND if query.symmetric else _CUT
 
     @functools.cached_property
+    def passed(self) -> Tensor:
+        """Of the light from the farthest and the nearest, what falls into the window, of a few wavelengths; of maps of
+        pixels by the model that stands for the others.
+        """
+        maps = self._widest is not None and self._widest.has_pixels
+        imaging = self.stage(PARAXIAL) if maps and not self.folded_across else self.imaging
+        return self.of(imaging, self.ends.unique(), self.few, Way.LINES)[0][..., 0].real.mean(-1)
+
+    @property
     def missed(self) -> bool:
-        """Whether hardly any light of a smooth pupil, as far as line spreads tell, falls into the window."""
-        if self.fits or self._widest is None or self._widest.has_pixels:
+        """Whether hardly any light from some distance of the scene, as far as line spreads tell, falls into the window
+        at some wavelength.
+        """
+        if self.fits or self._widest is None:
             return False
-        return float(self.of(self.imaging, self._ends.unique(), self.few, Way.LINES)[0][..., 0].real.max()) < _HARDLY
+        return bool(self.passed.min() < (_HARDLY_PIXELS if self._widest.has_pixel_phase else _HARDLY))
+
+    @property
+    def unlike(self) -> float:
+        """How much less light, as a share, falls into the window from one end of the scene than from the other: all of
+        it, of what is blurred far wider, or onto pixels that are points.
+        """
+        if self.fits and not self.folded_across:
+            return 0.0
+        light = self.passed.mean(1)
+        return 1 - float(light.min() / light.max().clamp(min=1e-300))
 
     def untold(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> float:
         """What a picture of the paraxial model errs at least, behind maps of pixels whose light mostly misses the
@@ -262,7 +294,7 @@ class Transfers:
     @functools.cached_property
     def _widest(self) -> Query | None:
         """The scene's ends in a whole window."""
-        return self._query(self.imaging, self._ends, self.wavelengths, self.window(self.imaging, self._ends))
+        return self._query(self.imaging, self.ends, self.wavelengths, self.window(self.imaging, self.ends))
 
     def _query(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Query | None:
         if not isinstance(lens := imaging.lens, Lens):
@@ -279,7 +311,7 @@ class Transfers:
         if self.folded_across:
             return None
         one = self.deep and len(vergences) == 1
-        among = torch.cat([self._ends[:1], vergences.cpu(), self._ends[1:]]) if one else vergences
+        among = torch.cat([self.ends[:1], vergences.cpu(), self.ends[1:]]) if one else vergences
         window, propagator = self.window(self.imaging, among), imaging.accuracy.propagator  # none is larger
         if propagator not in self._tabled:
             query = self._query(imaging, among, wavelengths, window)
@@ -311,7 +343,9 @@ class Transfers:
 
     def lines(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Table | None:
         """About the transfer functions of these wavelengths and others in this stage's window, if there is a way."""
-        if self._widest is not None and self._widest.folded(GAPS):
+        if self._widest is None or self._widest.folded(GAPS):
+            return None
+        if self.turned and (self._widest.has_pixels or not self._widest.lens.round):
             return None
         window, some = self.window(imaging, vergences), self._every_and(wavelengths)
         lens, bands = (imaging.accuracy.propagator, window), tuple(some.tolist())
@@ -319,6 +353,7 @@ class Transfers:
         if key not in self._tables:
             query, lines = self._query(imaging, vergences, some, window), None
             if query is not None:
+                query = replace(query, turned=self.turned)
                 if lens not in self._line_rows:  # the price of all wavelengths takes as long
                     self._line_rows[lens] = imaging.accuracy.row(replace(query, wavelengths=self.few))
                 lines = self._line_rows[lens].lines(query, self._lines.get((lens, bands)))
@@ -326,6 +361,15 @@ class Transfers:
             if lines is not None:
                 self._lines[lens, bands] = lines
         return self._tables[key]
+
+
+def _along_diagonals(bank: Tensor, frequencies: Tensor) -> Tensor:
+    """Slices of the transfer functions of PSFs (Z, G, h, w), (Z, G, 2, F)."""
+    right, down = along_axis(frequencies, turned=True)
+    y = torch.arange(bank.shape[-2], dtype=torch.float64) - bank.shape[-2] // 2
+    turns = torch.exp(-2j * math.pi * y[:, None] * down)
+    rows = _spectrum(bank.double(), right)  # (Z, G, h, F)
+    return torch.stack([(rows * turns).sum(-2), (rows.conj() * turns).sum(-2)], dim=2)
 
 
 def _spectrum(light: Tensor, frequencies: Tensor) -> Tensor:

@@ -17,7 +17,15 @@ from draws import Draw
 from torch import Tensor, nn
 
 import kcam
-from benchmarks.pairs import LATER, adversarial_pair, assorted_pair, hard_pair, later_scene, random_pair
+from benchmarks.pairs import (
+    LATER,
+    adversarial_pair,
+    assorted_pair,
+    hard_pair,
+    later_scene,
+    random_pair,
+    strange_pair,
+)
 from benchmarks.planner import TOLERANCES
 from kcam import Camera, Scene, isp, optics, sensor
 from kcam.effects import Work
@@ -232,6 +240,13 @@ def test_adversarial_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> 
 def test_assorted_pairs_stay_inside_the_tolerance(seed: int) -> None:
     """Apertures, elements, options and light as they are seldom put together."""
     shot, light, text, _ = assorted_pair(seed, sides=(32, 48, 64))
+    assert_inside(shot, light, (0.1, 0.01, 0.001), text)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4, *(pytest.param(n, marks=pytest.mark.slow) for n in range(2000, 2045))])
+def test_strange_pairs_stay_inside_the_tolerance(seed: int) -> None:
+    """Parts that know nothing of each other, and pictures of few pixels."""
+    shot, light, text, _ = strange_pair(seed)
     assert_inside(shot, light, (0.1, 0.01, 0.001), text)
 
 

@@ -133,6 +133,92 @@ def test_pixels_that_see_points_of_what_maps_scatter(seed: int) -> None:
     check(Camera(imaging, *bayer()), Scene.from_rgb(light_of(draw, 48), depth=draw.number(0.4, 1.5)))
 
 
+@pytest.mark.parametrize("seed", some(quick=4, slow=24))
+def test_what_is_near_covers_by_its_mask_however_wide_it_blurs(seed: int) -> None:
+    """Hardly any of its light falls into the picture, and yet it hides what is behind it."""
+    draw = Draw(seed)
+    focal, size = draw.one_of(25, 50, 85) * mm, draw.one_of(24, 40, 64)
+    width = focal / draw.number(2.5, 6)
+    aperture = draw.one_of(optics.CircularAperture(width), optics.AnnularAperture(width, obscuration=0.4))
+    lens = optics.Lens(aperture, optics.ThinLens(focal), focus_distance=draw.one_of(math.inf, 5.0))
+    depth = torch.full((1, 1, size, size), 5.0)
+    row, column = draw.whole(2, size - 4), draw.whole(0, size // 2)
+    depth[..., row:, column:] = draw.number(0.25, 0.5)
+    how = draw.one_of({}, {"border": "periodic"}, {"border": "zero"}, {"fill_factor": 0.3})
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(1.5, 6) * um, **how)
+    check(Camera(imaging, *draw.one_of((), bayer())), Scene.from_rgb(light_of(draw, size), depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=4, slow=24))
+def test_optics_that_are_astigmatic_along_the_diagonals(seed: int) -> None:
+    """Of which slices along x and y would not see what depth changes."""
+    draw = Draw(seed)
+    focal, size = draw.one_of(16, 25, 50) * mm, draw.one_of(40, 64)
+    axis = torch.linspace(-1, 1, 48, dtype=torch.float64)
+    twist = draw.number(4, 25) * draw.one_of(-1, 1)
+    coefficients = torch.zeros(6, dtype=torch.float64)
+    coefficients[4] = twist / (2 * math.pi) * 550 * nm / 2.45 / 2  # sqrt(6) rho^2 sin 2 theta
+    plate = draw.one_of(optics.ZernikeAberration(coefficients), optics.DOE(twist * axis * axis[:, None]))
+    aperture = draw.one_of(optics.CircularAperture, optics.SquareAperture)(focal / draw.number(8, 24))
+    lens = optics.Lens(aperture, optics.ThinLens(focal), plate, focus_distance=1.0)
+    middle = 1 + draw.number(-0.3, 0.3)
+    vergence = torch.linspace(middle - 0.4, middle + 0.4, size, dtype=torch.float64)
+    depth = (1 / vergence).expand(1, 1, size, size)
+    imaging = optics.Imaging(
+        lens, pixel_pitch=draw.number(1.5, 4) * um, occlusion=False, border=draw.one_of("reflect", "zero")
+    )
+    check(Camera(imaging, *draw.one_of((), bayer())), Scene.from_rgb(light_of(draw, size), depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=4, slow=24))
+def test_spectra_that_pixels_see_only_as_each_band_is_blurred_by_its_own(seed: int) -> None:
+    """A grey pixel sums over bands: what one has more and another less adds up to nothing, before the lens."""
+    draw = Draw(seed)
+    count, size = draw.whole(3, 9), draw.one_of(40, 64)
+    cube = torch.cat([light_of(draw, size) for _ in range(-(-count // 3))], dim=1)[:, :count].double()
+    cube = 0.5 + draw.number(0.05, 0.9) * (cube - 0.5)
+    if draw.one_of(True, False):
+        cube = cube / cube.sum(1, keepdim=True) * (0.5 + draw.number(0, 0.5) * light_of(draw, size)[:, :1])
+    wavelengths = torch.linspace(420, 680, count, dtype=torch.float64) * nm
+    focal = draw.one_of(8, 25) * mm
+    glass = draw.one_of(optics.PlanoConvexLens(0.5185 * focal, glass="N-SF11"), optics.ThinLens(focal))
+    plate = draw.one_of((), (optics.ZernikeDOE(torch.tensor([0, 0, 0, draw.number(1, 9), 0, 2])),))
+    lens = optics.Lens(optics.CircularAperture(focal / draw.number(4, 12)), glass, *plate, focus_distance=2.0)
+    grey = sensor.ColourFilter.from_curves(torch.tensor([380.0, 1000]) * nm, torch.tensor([[0.5, 0.5]]))
+    scene = Scene.from_bands(cube.float(), wavelengths=wavelengths, depth=draw.number(1, 4))
+    check(Camera(optics.Imaging(lens, pixel_pitch=draw.number(1.5, 6) * um), grey, sensor.Exposure()), scene)
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=16))
+def test_hardly_any_light_from_behind_maps_of_pixels(seed: int) -> None:
+    """Falls into the picture: line spreads know little of it, and the models differ in it."""
+    draw = Draw(seed)
+    focal, size = draw.one_of(35, 50, 85) * mm, draw.one_of(17, 24, 40)
+    width, pixels = focal / draw.number(4, 16), draw.one_of(5, 16, 33)
+    values = torch.rand(pixels, pixels, generator=draw.generator)
+    first = draw.one_of(optics.ApertureMap(values, width=width), optics.CircularAperture(width))
+    plate = draw.one_of((), (optics.DOE(draw.number(0.5, 6) * (values - 0.5)),))
+    lens = optics.Lens(first, optics.ThinLens(focal), *plate, focus_distance=draw.one_of(0.4, 1.0, math.inf))
+    depth: Any = draw.number(0.22, 0.35)
+    if draw.one_of(True, False):
+        depth = torch.full((1, 1, size, size), depth)
+        depth[..., : size // 2] = draw.number(0.8, 4)
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(1, 4) * um, border=draw.one_of("reflect", "periodic"))
+    check(Camera(imaging, *draw.one_of((), bayer())), Scene.from_rgb(light_of(draw, size), depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=16))
+def test_blur_of_less_than_a_pixel_that_differs_between_many_bands(seed: int) -> None:
+    draw = Draw(seed)
+    count, size, focal = draw.whole(9, 24), draw.one_of(32, 48), 4.3 * mm
+    cube = torch.cat([light_of(draw, size) for _ in range(8)], dim=1)[:, :count]
+    glass = optics.PlanoConvexLens(0.5185 * focal, glass=draw.one_of("N-BK7", "N-SF11"))
+    lens = optics.Lens(optics.CircularAperture(focal / draw.number(4, 12)), glass, focus_distance=1.0)
+    wavelengths = torch.linspace(*draw.one_of((420, 720), (380, 900)), count, dtype=torch.float64) * nm
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(10, 25) * um, fill_factor=draw.one_of(1.0, 0.6))
+    check(Camera(imaging), Scene.from_bands(cube, wavelengths=wavelengths, depth=draw.number(0.8, 1.2)))
+
+
 # ---- stages of one's own -----------------------------------------------------------------------------------------
 
 
