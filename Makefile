@@ -73,7 +73,8 @@ bench: $(VENV)/dev.stamp
 bench-augmentation: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks.augmentation
 
-# 300 random pairs of camera and scene, 100 hard, 200 adversarial and 100 assorted ones, planned at five tolerances and measured: two hours.
+# 300 random pairs of camera and scene, 100 hard, 200 adversarial, 100 assorted and 200 strange ones, planned at five
+# tolerances and measured: two hours.
 bench-planner: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.planner
 

@@ -136,7 +136,7 @@ def strange_sensor(draw: random.Random, generator: torch.Generator) -> tuple[lis
     elif name == "curves":
         nodes, count = draw.choice([2, 4, 9]), draw.choice([2, 3])
         curves = 0.05 + 0.9 * torch.rand(count, nodes, generator=generator)
-        stages.append(sensor.ColourFilter.from_curves(torch.linspace(400, 720, nodes) * nm, curves))
+        stages.append(sensor.ColourFilter.from_curves(torch.linspace(380, 900, nodes) * nm, curves))
     elif name == "grey":
         stages.append(sensor.ColourFilter.from_curves(torch.tensor([380, 1000]) * nm, torch.tensor([[0.5, 0.6]])))
     elif name == "tile":
@@ -221,4 +221,4 @@ def strange_depth(
         close = fractal_noise((batch, 1, height, width), 2.0, generator).double()
     else:
         close[..., height // 4 : height // 2, width // 4 : width // 2] = 1
-    return 1 / ((1 - close) / far + close / near).clamp(min=1e-9), f"{kind} {near:.2g} to {far:.2g} m"
+    return 1 / ((1 - close) / far + close / near), f"{kind} {near:.2g} to {far:.2g} m"
