@@ -388,7 +388,7 @@ def promise_tolerance() -> str:
 def plan_effects() -> str:
     """Whether plans keep their word of cameras with effects of light and sensor, and how near they come."""
     content = json.loads(EFFECTS_HONESTY.read_text())
-    found = {kind: content[kind] for kind in ("random", "hard", "adversarial")}
+    found = {kind: content[kind] for kind in ("random", "hard", "adversarial", "strange")}
     counts = ", ".join(f"{one['pairs']} {kind}" for kind, one in found.items())
     outside, worst = sum(one["outside"] for one in found.values()), max(one["worst"] for one in found.values())
     return (

@@ -75,6 +75,9 @@ def _place(stages: Sequence[torch.nn.Module], stage: torch.nn.Module) -> int | N
     colours, tile = first(sensor.ColourFilter), first(sensor.Mosaic) is None
     if isinstance(stage, sensor.Transmission):
         return colours
+    timed = any(isinstance(one, sensor.Exposure) and one.time is not None for one in stages)
+    if timed and isinstance(stage, sensor.Motion):  # whose own time would be another
+        return None
     if isinstance(stage, (optics.VeilingGlare, sensor.Motion, sensor.MicrolensShading)):
         return None if colours is None or tile else colours + 1
     if isinstance(stage, sensor.Crosstalk):

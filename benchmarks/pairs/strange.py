@@ -163,7 +163,8 @@ def strange_scene(draw: random.Random, sides: tuple[int, ...], generator: torch.
     height, width, batch = draw.choice(sides), draw.choice(sides), draw.choice([1, 1, 1, 2, 3])
     if batch > 1:
         height, width = min(height, 64), min(width, 64)
-    rgb, kind = draw.random() < 0.5, draw.choice(["noise", "noise", "noise", "lamps", "lines", "hot spot", "edges"])
+    rgb = draw.random() < 0.5
+    kind = draw.choice(["noise", "noise", "noise", "lamps", "lines", "hot spot", "edges"])
     count = 3 if rgb else draw.choice([1, 2, 3, 5, 8, 15, 28, 31])
     low, high = draw.choice([(420, 720), (400, 700), (500, 600), (380, 900)])
     planes = fractal_noise((batch, count, height, width), draw.uniform(0, 2.5), generator).float()

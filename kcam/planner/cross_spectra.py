@@ -25,7 +25,7 @@ def rings() -> Tensor:
 
 def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool, turned: bool = False) -> Tensor:
     """Cross-spectra of planes (K, H, W), mirrored at the borders, or in the dark: (2, F, K, K) of light that runs along
-    x, and y; turned: along the diagonals.
+    x, and y; turned: along the falling and the rising diagonal.
     """
     height, width = planes.shape[-2:]
     if dark:

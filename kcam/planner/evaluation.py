@@ -233,7 +233,8 @@ class Evaluator:
             tried = _error(self.samples, self.answers(changes), self.answers(against))
             if not (changes.get("blur") is False is against.get("blur") and self.certain):
                 return tried
-            unseen = self._apart * self._unseen(changes["rank"]) if "rank" in changes else 0.0
+            rank = changes.get("rank")
+            unseen = self._dispersion * self._left_out_by_rank(rank) if rank is not None else 0.0
             return self._dimming * max(self.lost.values(), default=1.0) * math.hypot(tried, unseen)
         if changes.get("occlusion") != against.get("occlusion"):
             return self._hidden(changes, against)
@@ -242,14 +243,14 @@ class Evaluator:
             found += self._relative(sample, torch.stack(spectra.energies(changes, against, care)))
         return max(found)
 
-    def _unseen(self, rank: int) -> float:
+    def _left_out_by_rank(self, rank: int) -> float:
         """RMS of what so few spectra leave out of all bands, relative to what is recorded: pixels see less of it, as
         long as light of all bands is blurred alike.
         """
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
             bands = sample.scene.bands()
-            off = (sample.scene.low_rank(rank).bands() - bands).square().sum((2, 3)).double().cpu()
+            off = (sample.low_rank(rank).bands() - bands).square().sum((2, 3)).double().cpu()
             weights = torch.eye(bands.shape[1]) if spectra.weights is None else spectra.weights
             seen = torch.einsum("rl,blhw->brhw", weights.to(bands), bands).square().sum((1, 2, 3)).double().cpu()
             for rows, factor in sample.of_owners():
@@ -257,12 +258,17 @@ class Evaluator:
                 found.append(factor * math.sqrt(power / max(float(seen[rows].sum()), 1e-300)))
         return max(found)
 
+    @property
+    def _told(self) -> dict[str, Any]:
+        """Of the settings with which the light was looked at, those that spectra tell."""
+        return {name: value for name, value in self._looked.items() if name in LINEAR - {"kappa"}}
+
     @functools.cached_property
-    def _apart(self) -> float:
-        """How far apart PSFs of the wavelengths are, relative to the contrast of what is seen, at most 1."""
-        told = {name: value for name, value in self._looked.items() if name in LINEAR - {"kappa"}}
-        if not self.missed:
-            told.pop("bands", None)
+    def _dispersion(self) -> float:
+        """How far apart PSFs of the wavelengths are, relative to the contrast of what is seen, at most 1: of all, but
+        where that takes their PSFs.
+        """
+        told = dict(self._told) if self.missed else {k: v for k, v in self._told.items() if k != "bands"}
         found = [0.0]
         for spectra in self.spectra or ():
             off, all_of_it = spectra.energies({**told, "bands": 1}, told)
@@ -276,8 +282,7 @@ class Evaluator:
         """
         if self.dimmed:
             return max(self.dimmed)
-        told = {name: value for name, value in self._looked.items() if name in LINEAR - {"kappa"}}
-        return max((row for spectra in self.spectra or () for row in spectra.dimmed(told)), default=1.0)
+        return max((row for spectra in self.spectra or () for row in spectra.dimmed(self._told)), default=1.0)
 
     def error_of(self, off: float) -> float:
         """The error of transfer functions that are off by so much of all light at most, at any frequency."""

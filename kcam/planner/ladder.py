@@ -63,7 +63,7 @@ class Ladder:
     seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`),
     by `most`, what was allowed when it was last priced.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
-    surely: other settings beside which a rung that may do is priced again.
+    confirmed_beside: other settings, beside which a rung that may do is priced again.
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; takes:
@@ -89,7 +89,7 @@ class Ladder:
     marks: tuple[int, ...] = ()
     seams: Callable[[Level], float] | None = None
     least: float = 0.0
-    surely: dict[str, Any] | None = None
+    confirmed_beside: dict[str, Any] | None = None
     bounds: dict[int, float] = field(default_factory=dict)
     small: float = SMALL
     doubtful: bool = False
@@ -186,8 +186,8 @@ class Ladder:
                 self.errors[key] = self._coloured(evaluator, position)
         elif self.off_by == 1 or not self._settled(self._roughly(evaluator, position), most):
             self.levels[position], self.errors[key] = self._best(evaluator, position)
-            if self.surely is not None and self.errors[key] <= most:
-                self.errors[key] = max(self.errors[key], self._best(evaluator, position, **self.surely)[1])
+            if self.confirmed_beside is not None and self.errors[key] <= most:
+                self.errors[key] = max(self.errors[key], self._best(evaluator, position, **self.confirmed_beside)[1])
 
     @property
     def _by_one(self) -> bool:

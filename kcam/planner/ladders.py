@@ -130,7 +130,7 @@ def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[La
     evaluator.look(view.beside | view.coarse)
     if evaluator.missed:  # which is known now
         view = _View(evaluator, imaging, scene, one=one)
-    make_ladders = (_blur,) if evaluator.missed and one else LADDERS  # what takes PSFs to know does not pay
+    make_ladders = (_blur, _precision, _rank) if evaluator.missed and one else LADDERS  # the others take PSFs to know
     found = [ladder for make in make_ladders for ladder in make(view)]
     for ladder in found:
         ladder.least = max(ladder.least, ROUNDED[view.dtype])
@@ -240,7 +240,10 @@ def _blur(view: _View) -> Iterator[Ladder]:
     levels = [Level("none", {"blur": False}), Level(label, {})]
     if view.trained:
         levels = levels[1:]  # a parameter of the lens that trains acts through it
-    yield Ladder("diffraction", levels, view.beside, blurs=False, surely={"bands": None})
+    ladder = Ladder("diffraction", levels, view.beside, blurs=False)
+    if "bands" in view.beside:
+        ladder.confirmed_beside = {"bands": view.imaging.accuracy.bands}
+    yield ladder
 
 
 def _model(view: _View) -> Iterator[Ladder]:

@@ -64,7 +64,7 @@ _WIDE = 1 / 8  # of the picture's shorter side, the radius of such a blur
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
 _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
 _COLOURED = 2.0  # times what is beyond that, the energy that a choice of wavelengths errs more: masks are white
-_UNLIKE_LAYERS = 0.75  # of the light that falls into the window from a layer, that does not from another, from which on
+_LOST = 0.75  # of the light that falls into the window from a layer, that does not from another, from which on
 # they are not, and veil what is behind: wavelengths before 40 such scenes were told 1.1 times the truth and more
 _MOST_VEILED = 0.9  # of what is behind
 _MOST = 0.9  # of the light, that a window must hold through which it is looked at
@@ -293,8 +293,9 @@ class Spectra:
         if care is not Care.FULL and not _differ(changes, against, WINDOW):
             changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
-            colours = not _differ(changes, against, LINEAR - COLOURS)
-            replaced = torch.where(self.few_lights & colours, _HIDDEN_LIGHTS, self._replaced)
+            colours, replaced = not _differ(changes, against, LINEAR - COLOURS), self._replaced
+            if colours and self._hides:
+                replaced = torch.where(self.few_lights, _HIDDEN_LIGHTS, replaced)
             off, all_of_it = self._linear(changes, against, care, replaced)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
@@ -308,19 +309,19 @@ class Spectra:
 
     def _by_masks(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care, hidden: Tensor) -> Tensor:
         """The energy by which what is hidden is off as masks are, of all that there is, (B,): `_EDGES` of it, more
-        where much is hidden, and all of it where light of some layers does not fall into the window, which is where
-        masks have colours.
+        where much is hidden, and all of it where light of some layers does not fall into the window (`_LOST`): there
+        masks have colours, and errors are relative to what they leave of the light behind.
         """
-        unlike, colours = self.optics.unlike, not _differ(changes, against, LINEAR - COLOURS)
-        if colours and unlike < _UNLIKE_LAYERS:
+        lost, colours = self.optics.lost_between_ends, not _differ(changes, against, LINEAR - COLOURS)
+        if colours and lost < _LOST:
             return torch.zeros_like(hidden)
         of_masks = {**changes, **WHOLE}, {**against, **WHOLE}
         off, even = self._masks._linear(*of_masks, care, torch.full_like(hidden, _HIDDEN))
-        share = torch.full_like(hidden, unlike)
+        share = torch.full_like(hidden, lost)
         if not colours:
-            share = (_EDGES + _drowned(hidden) + unlike).clamp(max=1)
+            share = (_EDGES + _drowned(hidden) + lost).clamp(max=1)
         said = share * hidden * off / even.clamp(min=1e-300)
-        return said if unlike < _UNLIKE_LAYERS else said / (1 - self._veiled) ** 2
+        return said if lost < _LOST else said / (1 - self._veiled) ** 2
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
         """The same of some rows, and of what hides what: tried out."""
@@ -354,7 +355,7 @@ class Spectra:
             if way is Way.LINES and _differ(changes, against, {"propagator"}):
                 least = self.optics.untold(self.optics.stage(against), layered.vergences, self.wavelengths)
                 found[0, rows] = found[0, rows].maximum(least**2 * found[1, rows])
-            if len(layered.vergences) > 1 and self._hides:
+            if len(layered.vergences) > 1:
                 found[0, rows] *= replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]
 
@@ -394,6 +395,8 @@ class Spectra:
         """Times the error without occlusion that there is with it, (B,): more of a few lights or patches of light, and
         where something near is seen through.
         """
+        if not self._hides:
+            return torch.ones_like(self._unlike)
         defocus = self.optics.defocus
         found = torch.where(self.few_lights, _HIDDEN_LIGHTS, _HIDDEN).double()
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()

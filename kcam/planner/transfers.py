@@ -191,9 +191,9 @@ class Transfers:
         along, across = along_axis(self.frequencies)
         axis, slices = along < 0.5, []
         sums = []  # over x, and over y: of every other pixel, the middle one among the first
-        for turned in (bank, bank.mT):
-            first = turned.shape[-1] // 2 % 2
-            sums.append([turned[..., start::2].sum(-1, dtype=torch.float64) for start in (first, 1 - first)])
+        for planes in (bank, bank.mT):
+            first = planes.shape[-1] // 2 % 2
+            sums.append([planes[..., start::2].sum(-1, dtype=torch.float64) for start in (first, 1 - first)])
         for (even, odd), (even_across, odd_across) in (sums[::-1], sums):
             own = _spectrum(even + odd, along[axis]), _spectrum(even_across - odd_across, across[~axis])
             slices.append(torch.cat(own, dim=-1))
@@ -233,8 +233,8 @@ class Transfers:
 
     @functools.cached_property
     def passed(self) -> Tensor:
-        """Of the light from the farthest and the nearest, what falls into the window, of a few wavelengths; of maps of
-        pixels by the model that stands for the others.
+        """Of the light from the farthest and the nearest, what falls into the window, (2 or 1, L) of a few wavelengths;
+        of maps of pixels by the model that stands for the others.
         """
         maps = self._widest is not None and self._widest.has_pixels
         imaging = self.stage(PARAXIAL) if maps and not self.folded_across else self.imaging
@@ -250,7 +250,7 @@ class Transfers:
         return bool(self.passed.min() < (_HARDLY_PIXELS if self._widest.has_pixel_phase else _HARDLY))
 
     @property
-    def unlike(self) -> float:
+    def lost_between_ends(self) -> float:
         """How much less light, as a share, falls into the window from one end of the scene than from the other: all of
         it, of what is blurred far wider, or onto pixels that are points.
         """
@@ -364,12 +364,14 @@ class Transfers:
 
 
 def _along_diagonals(bank: Tensor, frequencies: Tensor) -> Tensor:
-    """Slices of the transfer functions of PSFs (Z, G, h, w), (Z, G, 2, F)."""
+    """Slices of the transfer functions of PSFs (Z, G, h, w) along the falling and the rising diagonal, (Z, G, 2, F)."""
     right, down = along_axis(frequencies, turned=True)
     y = torch.arange(bank.shape[-2], dtype=torch.float64) - bank.shape[-2] // 2
-    turns = torch.exp(-2j * math.pi * y[:, None] * down)
-    rows = _spectrum(bank.double(), right)  # (Z, G, h, F)
-    return torch.stack([(rows * turns).sum(-2), (rows.conj() * turns).sum(-2)], dim=2)
+    turns, found = torch.exp(-2j * math.pi * y[:, None] * down), []
+    for psfs in bank:
+        rows = _spectrum(psfs.double(), right)  # (G, h, F)
+        found.append(torch.stack([torch.einsum("ghf,hf->gf", part, turns) for part in (rows, rows.conj())], dim=1))
+    return torch.stack(found)
 
 
 def _spectrum(light: Tensor, frequencies: Tensor) -> Tensor:

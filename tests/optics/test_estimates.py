@@ -295,5 +295,9 @@ def test_where_defocus_shows_along_the_diagonals(seed: int) -> None:
         for plate in (optics.ZernikeAberration(coefficients), optics.DOE(phases[oblique])):
             lens = optics.Lens(optics.CircularAperture(2 * mm), optics.ThinLens(25 * mm), plate, focus_distance=1.0)
             vergences = torch.tensor([1 + focus - 0.2, 1 + focus + 0.2], dtype=torch.float64)
-            wavelengths = torch.tensor([550 * nm], dtype=torch.float64)
-            assert is_oblique(lens.question(Points(vergences), wavelengths, PixelGrid(3 * um, (65, 65)))) == oblique
+            wide = optics.DOE(torch.zeros(3, 3), pitch=4 * mm)  # no corner of its pixels is in the pupil
+            for own in (lens, optics.Lens(*lens.elements, wide, focus_distance=1.0)):
+                question = own.question(
+                    Points(vergences), torch.tensor([550 * nm], dtype=torch.float64), PixelGrid(3 * um, (65, 65))
+                )
+                assert is_oblique(question) == oblique

@@ -49,7 +49,7 @@ OF_DEPTH = [
     "seed", [n if n in (0, 2, 3, 6) else pytest.param(n, marks=pytest.mark.slow) for n in range(40)]
 )
 def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
-    """Cameras and scenes of benchmarks/pairs.py: at one distance to two fifths; not much too small, and at most 2.5
+    """Cameras and scenes of benchmarks/pairs: at one distance to two fifths; not much too small, and at most 2.5
     times as large where few points are all the light (they show corners and colours of pixels), three times where a
     window as large as the picture is smaller than the blur; with depth, where things hide others, four to eight times,
     and by as much more as is said of few lights in layers, and of what is seen through little; beyond the full well not
@@ -1092,12 +1092,26 @@ def test_cross_spectra_are_sums_over_rings(seed: int, dark: bool, turned: bool) 
         parts = [(fy.abs()[:, None] <= fx.abs(), 1.0), (fy.abs()[:, None] > fx.abs(), 1.0)]
         if turned:
             down, edge = fy[:, None] * fx < 0, (fy.abs()[:, None] == 0.5) | (fx.abs() == 0.5) | (fx == 0)
-            if dark and bool(((nearest == ring) & edge).any()):
-                continue  # both signs of a frequency are one there
+            if dark and bool(((nearest == ring) & edge).any()):  # where both signs of a frequency are one
+                own = spectrum[:, nearest == ring]
+                torch.testing.assert_close(found[:, ring].sum(0), (own @ own.mH).real, rtol=1e-4, atol=1e-5)
+                continue
             parts = [(~down, 1.0), (down, 1.0)] if dark else [(nearest >= 0, 0.5)] * 2
         for axis, (runs, share) in enumerate(parts):
             own = spectrum[:, (nearest == ring) & runs]
             torch.testing.assert_close(found[axis, ring], share * (own @ own.mH).real, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_slices_of_psfs_along_the_diagonals_are_their_transfer_functions(seed: int) -> None:
+    draw = Draw(seed)
+    bank, frequencies = draw.noise(2, 3, draw.whole(5, 20), draw.whole(5, 20)), cross_spectra.rings()
+    found = transfers._along_diagonals(bank, frequencies)
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in bank.shape[-2:])
+    for index, sign in enumerate((1, -1)):
+        places = (y[:, None] + sign * x) * math.sqrt(0.5)
+        expected = torch.einsum("zghw,hwf->zgf", bank + 0j, torch.exp(-2j * math.pi * places[..., None] * frequencies))
+        torch.testing.assert_close(found[:, :, index], expected)
 
 
 @pytest.mark.parametrize(("count", "own"), [(3, True), (12, True), (60, False)])

@@ -23,7 +23,7 @@ from kcam.optics.source import Points
 
 _SIDE = 65  # of the grid on which rays are traced
 _COARSE = 17  # of that on which their second order is looked at
-_TURNED, _COHERENT = 2.0, 0.2  # c from which on a phase is oblique [rad], and of the energy of all slopes
+_TURNED, _COHERENT = 2.0, 0.2  # c [rad], and its share of the energy of all slopes, from which on a phase is oblique
 _NEAR = 1e-5  # of the semi-aperture: the step over which a slope is taken
 _RADII = 96  # of the window over which errors are summed
 _QUANTILES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.0)  # of the rim's displacements
@@ -129,10 +129,10 @@ def is_oblique(query: Query) -> bool:
                 continue
             share = 1.0 if pixels.half_width is None else float(pixels.half_width / query.semi_aperture)
             corners = (torch.arange(1, count).to(side) * (2 / count) - 1) * share
-            down, across = (step * (count / (2 * share)) for step in pixels.steps())
+            down, across = (step.to(side) * (count / (2 * share)) for step in pixels.steps())
             down, across = (down[:, 1:] + down[:, :-1]) / 2, (across[1:] + across[:-1]) / 2
             found = found + _second_order(query, down, across, corners)
-        (low, high), (_, q, c, energy) = found[0].aminmax(), found.amin(1)
+        (low, high), (_, q, c, energy) = found[0].aminmax(), found.amin(1)  # energy: where slopes are least
         focus = (low**2 + low * high + high**2) / 3  # in the mean over distances in between
         return bool((c.abs() > _TURNED) & (c**2 > focus + 2 * q**2) & (c**2 > _COHERENT * energy))
 
@@ -144,7 +144,7 @@ def _second_order(query: Query, down: Tensor, across: Tensor, side: Tensor) -> T
     u, v = side, side[:, None]
     r2 = u**2 + v**2
     weights = (r2 <= 1) if query.lens.round else torch.maximum(u.abs(), v.abs()) <= 1
-    weights = weights / (weights * r2).sum()
+    weights = weights / (weights * r2).sum().clamp(min=1e-300)  # of pixels as wide as the pupil no corner may lie in it
     parts = across * u + down * v, across * u - down * v, across * v + down * u, across**2 + down**2
     return torch.stack([(weights * part).sum((-2, -1)) for part in parts]).view(4, -1)
 
