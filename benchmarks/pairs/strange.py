@@ -114,10 +114,8 @@ def strange_imaging(draw: random.Random, lens: optics.Lens) -> tuple[optics.Imag
         "bands": (0.05, (1, 3)),
     }
     options = {name: draw.choice(values) for name, (share, values) in choices.items() if draw.random() < share}
-    pitch, border = (
-        draw.choice([1, 1.4, 2.2, 3.45, 5, 8, 12]),
-        draw.choice(["reflect", "replicate", "periodic", "zero"]),
-    )
+    pitch = draw.choice([1, 1.4, 2.2, 3.45, 5, 8, 12])
+    border = draw.choice(["reflect", "replicate", "periodic", "zero"])
     text = ", ".join([f"{pitch:g} um", border, *(f"{name} {value}" for name, value in options.items())])
     return optics.Imaging(lens, pixel_pitch=pitch * um, border=border, **options), text
 
