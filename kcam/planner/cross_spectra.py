@@ -28,14 +28,16 @@ def cross_spectra(planes: Tensor, frequencies: Tensor, *, dark: bool, turned: bo
     x, and y; turned: along the falling and the rising diagonal.
     """
     height, width = planes.shape[-2:]
+    order, beyond, into = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark, turned=turned)
     if dark:
         sides = padded(height), padded(width)
-        found = scipy.fft.rfftn(planes.cpu().numpy(), s=sides, axes=(-2, -1), norm="ortho")
+        found = torch.fft.rfft2(planes.cpu(), s=sides, norm="ortho")
         found[..., 1 : sides[1] // 2] *= math.sqrt(2)  # each stands for one to the left of the middle, too
+        spectrum = found.flatten(1).gather(1, order.expand(len(planes), -1))  # index_select takes four times as long
     else:
-        found = scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho")
-    order, beyond, into = _in_rings(height, width, tuple(frequencies.tolist()), dark=dark, turned=turned)
-    spectrum = torch.as_tensor(found).flatten(1).index_select(1, order).index_fill_(1, beyond, 0)
+        found = torch.as_tensor(scipy.fft.dctn(planes.cpu().numpy(), axes=(-2, -1), norm="ortho"))
+        spectrum = found.flatten(1).index_select(1, order)
+    spectrum = spectrum.index_fill_(1, beyond, 0)
     if dark:
         spectrum = torch.view_as_real(spectrum).flatten(1)
     parts = spectrum.unflatten(1, (len(into), -1)).transpose(0, 1)

@@ -65,6 +65,7 @@ class Ladder:
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     confirmed_beside: other settings, beside which a rung that may do is priced again.
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
+    at_least: about what they err at least: where that is too much, they are not priced.
     doubtful: whether it is left out where its foot saves no time, or for a single picture less than pricing takes;
     tried: whether pricing takes so much that it is looked at last, where it saves enough, see `Prices.worth`; takes:
     seconds for it, None for those of the PSFs of its foot and its top; foreseen: about what its foot errs, by which it
@@ -91,6 +92,7 @@ class Ladder:
     least: float = 0.0
     confirmed_beside: dict[str, Any] | None = None
     bounds: dict[int, float] = field(default_factory=dict)
+    at_least: dict[int, float] = field(default_factory=dict)
     small: float = SMALL
     doubtful: bool = False
     tried: bool = False
@@ -126,7 +128,12 @@ class Ladder:
         if position == len(self.levels) - 1:
             return 0.0
         known = self.errors if key in self.errors else self.grey
-        error = max(known[key], self.least) if key in known else self.off_by * self.roughly[self.rough][key]
+        if key in known:
+            error = max(known[key], self.least)
+        elif key in self.roughly[self.rough]:
+            error = self.off_by * self.roughly[self.rough][key]
+        else:
+            error = self.at_least[position]
         return math.hypot(error, self.seams(self.levels[position])) if self.seams and self.most < FINE else error
 
     def _key(self, position: int) -> tuple[int, int]:
@@ -171,7 +178,7 @@ class Ladder:
 
     def _price(self, evaluator: Evaluator, position: int, most: float) -> None:
         key = self._key(position)
-        if position == len(self.levels) - 1 or key in self.errors:
+        if position == len(self.levels) - 1 or key in self.errors or self.at_least.get(position, 0.0) > most:
             return
         if self.nothing:
             self.errors[key] = 0.0
@@ -310,7 +317,8 @@ class Ladder:
         if self.position == 0:
             return "" if len(self.levels) == 1 else "the least there is suffices"
         parts = (*self.roughly.values(), self.grey, self.errors)
-        known = {key: error for part in parts for key, error in part.items()}
+        known = {(position, 0): error for position, error in self.at_least.items()}
+        known |= {key: error for part in parts for key, error in part.items()}
         below = max((key for key in known if key[0] < self.position), default=None)
         if below is None:
             return "would save less time than it takes to find out"

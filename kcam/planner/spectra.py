@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import enum
 import functools
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,7 +31,7 @@ from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.cross_spectra import cross_spectra
 from kcam.planner.light import UNSEEN, blurred, compressed, contrast, few_lights, hues, lights, recorded
-from kcam.planner.transfers import GROUPS, PARAXIAL, Transfers, Way
+from kcam.planner.transfers import PARAXIAL, Transfers, Way
 from kcam.scene import Scene
 
 LINEAR = {"blur", "bands", "interpolate_bands", "psf_shape", "renormalise", "kappa", "propagator"}
@@ -337,12 +336,13 @@ class Spectra:
     ) -> tuple[Tensor, Tensor]:
         """As `energies`; replaced: times the error without occlusion that there is with it, (B,)."""
         found = torch.zeros(2, len(self.scene.coefficients), dtype=torch.float64)
-        way = self._way(changes, against, care)
+        way, more = self._way(changes, against, care)
         # layers lie between others, and windows cut the same off all of them: 1.0 to 1.2 times the truth, measured
         corners = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
-        factor, colours = torch.tensor(corners, dtype=torch.float64), not _differ(changes, against, LINEAR - COLOURS)
+        colours = not _differ(changes, against, LINEAR - COLOURS)
+        factor = torch.tensor(corners * more, dtype=torch.float64)
         if colours:
-            factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
+            factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours * more)
         if _differ(changes, against, {"interpolate_bands"}):
             factor = factor * self.optics.between_psfs
         if PARAXIAL.items() <= changes.items() and PARAXIAL.items() <= against.items():
@@ -359,16 +359,16 @@ class Spectra:
                 found[0, rows] *= replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]
 
-    def _way(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> Way:
-        """How transfer functions are found that tell of changes."""
+    def _way(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> tuple[Way, float]:
+        """How transfer functions are found that tell of changes, and times the error that they tell."""
         by_psfs = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
         if by_psfs or (_differ(changes, against, COLOURS | {"layers"}) and self.optics.missed):
-            return Way.PSFS
+            return Way.PSFS, 1.0
         if care is Care.AT_FIRST:
-            return Way.WHOLE_LINES
-        if _differ(changes, against, COLOURS) and (changes.get("bands") or math.inf) <= GROUPS:
-            return Way.BETWEEN_LINES
-        return Way.LINES
+            return Way.WHOLE_LINES, 1.0
+        if _differ(changes, against, COLOURS) and self.by_lines(against):
+            return self.optics.between(changes.get("bands"))
+        return Way.LINES, 1.0
 
     @functools.cached_property
     def _veiled(self) -> Tensor:

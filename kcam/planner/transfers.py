@@ -30,17 +30,18 @@ from kcam.scene import Scene
 PARAXIAL = {"propagator": "fresnel"}
 """The model that leaves out what spheres have beyond their parabolas, as changes of an Imaging."""
 
-_BETWEEN_LINES = 12  # wavelengths, between whose line spreads those of all bands lie
-_ASKED = 4  # PSFs, up to how many a choice of wavelengths is mostly asked about: their line spreads are known as well,
-_NEAR, _APART = 0.35, 0.25  # and stand for those of others where they are so near, in steps; of two less far apart than
-# the latter cubics take one
-GROUPS = 7  # PSFs, up to whose number errors are told so: 0.9 to 1.15 times what they are by each band's own line
-# spread (5 to 95 % of 36 deep scenes behind maps), and 0.9 to 1.3 of PSFs between others, of which 6 are told worst
+_FEW_LINES = 12  # wavelengths of a scene, between whose line spreads those of others lie
+_APART = 0.25  # of their steps, at least; of two that are less far apart cubics take one
+_BETWEEN = {6.0: 1.0, 3.0: 1.1, 2.4: 1.2}  # line spreads for each PSF, at least, of which its own lies between some;
+# and times the error that they tell then: 0.6 to 1.25 times what each one's own tell, of which the truth is half in the
+# median (600 choices before random, strange and adversarial pairs)
+_BESIDE = 1.7  # line spreads for each PSF, at least, between which only those of all bands lie: 0.9 to 1.15 times what
+# they are by each one's own (5 to 95 % of 36 deep scenes behind maps)
 _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
 # would be told too little without; few lights may fall into a corner
-_BETWEEN, _BETWEEN_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
+_SMOOTH, _SMOOTH_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
 # slices tell of a PSF, and of a map of pixels, of which only some rows are looked at: 0.75 to 1.24 times the truth of
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
@@ -57,12 +58,15 @@ _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found 
 
 class Way(Enum):
     """How transfer functions are found that are in no table: by PSFs; by line spreads, where there are any: of each
-    wavelength, of most between some, or of the whole window, of which a smaller one cuts some off.
+    wavelength; of a few of the scene's, between which others lie, or all bands beside PSFs for several; of all of them,
+    between which PSFs for several lie; or of the whole window, of which a smaller one cuts some off.
     """
 
     PSFS = auto()
     LINES = auto()
-    BETWEEN_LINES = auto()
+    BETWEEN_FEW = auto()
+    BESIDE_FEW = auto()
+    BETWEEN_ALL = auto()
     WHOLE_LINES = auto()
 
 
@@ -119,24 +123,14 @@ class Transfers:
         """Wavelengths that tell of others."""
         return self.stage({"bands": FEW_BANDS}).psf_wavelengths(self.wavelengths)
 
-    def _standing(self, most: int) -> Tensor:
-        """Wavelengths whose PSFs may stand for others: those of a few that tell of others, and of so many at most."""
-        own, deep = self.wavelengths, self.deep
-        counts = [n for n in (group_counts if deep else node_counts)(len(own)) if n <= most]
-        few = [{"bands": 1}, {"bands": FEW_BANDS}, *({"bands": n} if deep else interpolated(n) for n in counts)]
-        return torch.cat([self.stage(one).psf_wavelengths(own, deep=deep) for one in few]).unique()
-
-    @functools.cached_property
-    def _asked(self) -> Tensor:
-        """Those that choices mostly ask for."""
-        return self._standing(_ASKED)
-
     @functools.cached_property
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
-        own, stages = self.wavelengths, (self.stage({"bands": None}), self.imaging)
-        bands = [stage.psf_wavelengths(own, deep=self.deep) for stage in stages]
-        return torch.cat([self._standing(len(own)), *bands]).unique()
+        own, deep = self.wavelengths, self.deep
+        counts = (group_counts if deep else node_counts)(len(own))
+        some = [{"bands": n} if deep else interpolated(n) for n in counts]
+        stages = [*map(self.stage, ({"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, *some)), self.imaging]
+        return torch.cat([stage.psf_wavelengths(own, deep=deep) for stage in stages]).unique()
 
     def _every_and(self, wavelengths: Tensor) -> Tensor:
         """These, and those of `_every`: mostly they are among them."""
@@ -145,17 +139,35 @@ class Transfers:
             self._unions[key] = torch.cat([self._every, wavelengths]).unique()
         return self._unions[key]
 
+    def between(self, psfs: int | None) -> tuple[Way, float]:
+        """How line spreads tell what so many PSFs for all wavelengths cost, and times the error that they tell."""
+        bands = len(self.wavelengths)
+        if psfs is None or bands <= _FEW_LINES:
+            return Way.LINES, 1.0
+        few, every = (
+            next((factor for each, factor in _BETWEEN.items() if each * psfs <= lines), None)
+            for lines in (_FEW_LINES, bands)
+        )
+        if few is not None:
+            return Way.BETWEEN_FEW, few
+        if _BESIDE * psfs <= _FEW_LINES:
+            return Way.BESIDE_FEW, 1.0
+        return (Way.LINES, 1.0) if every is None else (Way.BETWEEN_ALL, every)
+
     def of(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way) -> tuple[Tensor, Tensor | None]:
         """Slices along x and y, or both diagonals, at G wavelengths, (Z, G, 2, F), and what each gives to each band of
-        light of wavelengths (L,), (L, G). Of line spreads, of which each takes its time, those of all bands may lie
-        between some.
+        light of wavelengths (L,), (L, G).
         """
         groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
         shares = imaging.shares(wavelengths, deep=self.deep)
-        many = way is Way.BETWEEN_LINES and shares is None and len(groups) > _BETWEEN_LINES
-        if many and not self.table(imaging, vergences, groups) and self.lines(imaging, vergences, groups):
-            groups = _ends_and_between(wavelengths, _BETWEEN_LINES, self._asked)
-            shares = _cubics(groups, wavelengths)
+        nodes = wavelengths
+        if way is Way.BETWEEN_FEW or (way is Way.BESIDE_FEW and shares is None):
+            nodes = _ends_and_between(wavelengths, _FEW_LINES)
+        elif way is not Way.BETWEEN_ALL:
+            nodes = groups
+        if not set(groups.tolist()) <= set(nodes.tolist()):
+            between = _cubics(nodes, groups)
+            groups, shares = nodes, between if shares is None else shares.to(between) @ between
         return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
 
     def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
@@ -274,7 +286,7 @@ class Transfers:
     @functools.cached_property
     def between_psfs(self) -> float:
         """Times the error of PSFs that lie between others."""
-        return _BETWEEN_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _BETWEEN
+        return _SMOOTH_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _SMOOTH
 
     @functools.cached_property
     def corners_of_colours(self) -> float:
@@ -380,16 +392,13 @@ def _spectrum(light: Tensor, frequencies: Tensor) -> Tensor:
     return light.cpu().to(torch.complex128) @ torch.exp(-2j * math.pi * x[:, None] * frequencies)
 
 
-def _ends_and_between(wavelengths: Tensor, count: int, known: Tensor) -> Tensor:
-    """The outermost of the wavelengths (L,), and so many less two of those between, or of the known ones that are
-    `_NEAR` enough, that 1/wavelength goes in even steps, nearly.
+def _ends_and_between(wavelengths: Tensor, count: int) -> Tensor:
+    """The outermost of the wavelengths (L,), and so many less two of those between, so that 1/wavelength goes in even
+    steps, nearly.
     """
     numbers = 1 / wavelengths
     even = torch.linspace(float(numbers.min()), float(numbers.max()), count).to(numbers)
-    found = wavelengths[(numbers - even[:, None]).abs().argmin(1)]
-    off, nearest = (1 / known - even[1:-1, None]).abs().min(1)
-    found[1:-1] = torch.where(off < _NEAR * (even[1] - even[0]), known[nearest], found[1:-1])
-    found = found.unique()
+    found = wavelengths[(numbers - even[:, None]).abs().argmin(1)].unique()
     apart = -(1 / found).diff() > _APART * (even[1] - even[0])
     apart[-2] &= apart[-1]  # the last but one, from the one before and from the end
     return torch.cat([found[:1], found[1:-1][apart[:-1]], found[-1:]])

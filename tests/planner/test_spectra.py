@@ -72,7 +72,7 @@ def test_an_error_from_spectra_is_that_of_the_picture(seed: int) -> None:
             ratio = evaluator.error(ours, theirs) / max(trial, 1e-30)
             if 1e-3 < trial < 1:
                 points = "points" in text
-                of_flat = (0.6, 3.0) if not fits else (0.6, 2.5) if points else (0.7, 1.5)
+                of_flat = (0.6, 3.0) if not fits else (0.6, 2.5) if points else (0.7, 1.65)
                 low, high = of_flat if flat else (0.6, through * (4.0 if fits else 8.0 if points else 5.0))
                 if few and ours.get("layers", 1) > 1 and ours["layers"] != theirs["layers"]:
                     high *= 7
@@ -98,7 +98,7 @@ def test_line_spreads_of_all_wavelengths_lie_between_a_few(seed: int, monkeypatc
     rungs = [{"bands": n} for n in group_counts(28)] if is_deep(scene) else [*map(interpolated, node_counts(28))]
     found = []
     for between in (12, 99):
-        monkeypatch.setattr(transfers, "_BETWEEN_LINES", between)
+        monkeypatch.setattr(transfers, "_FEW_LINES", between)
         with torch.no_grad():
             planner = Planner(camera, scene, one=True)
             planner.plan(0.01)
