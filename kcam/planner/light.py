@@ -77,11 +77,12 @@ def compressed(scene: Scene) -> Scene:
     that the rest counts beside a few bright lights, and dim items beside bright ones.
     """
     planes, spectra = _factors(scene)
-    spectra = spectra.to(planes)
-    onto_light = torch.linalg.qr(spectra.T).R  # as long as the radiance
-    light = torch.einsum("lk,bkhw->blhw", onto_light, planes).square().sum(1, keepdim=True).sqrt()
-    light = light.clamp(min=torch.finfo(planes.dtype).tiny)
-    flat = (planes / light.sqrt() / light.sum((-2, -1), keepdim=True).sqrt()).transpose(0, 1).flatten(1)
+    spectra, radiance = spectra.to(planes), planes
+    if scene.spectra is not None:
+        radiance = torch.einsum("lk,bkhw->blhw", torch.linalg.qr(spectra.T).R, planes)  # as long as the radiance
+    light = radiance.square().sum(1, keepdim=True).sqrt().clamp(min=torch.finfo(planes.dtype).tiny)
+    even = (light.sqrt() * light.sum((-2, -1), keepdim=True).sqrt()).reciprocal()
+    flat = (planes * even).transpose(0, 1).flatten(1)
     energies, directions = torch.linalg.eigh((spectra.T @ (flat @ flat.T) @ spectra).double())
     left_out = energies.clamp(min=0).cumsum(0)
     for share in _WHOLE:

@@ -139,6 +139,11 @@ class Transfers:
             self._unions[key] = torch.cat([self._every, wavelengths]).unique()
         return self._unions[key]
 
+    @functools.cached_property
+    def _nodes(self) -> Tensor:
+        """Of all bands, those between whose line spreads those of others lie."""
+        return _ends_and_between(self.wavelengths, _FEW_LINES)
+
     def between(self, psfs: int | None) -> tuple[Way, float]:
         """How line spreads tell what so many PSFs for all wavelengths cost, and times the error that they tell."""
         bands = len(self.wavelengths)
@@ -146,11 +151,11 @@ class Transfers:
             return Way.LINES, 1.0
         few, every = (
             next((factor for each, factor in _BETWEEN.items() if each * psfs <= lines), None)
-            for lines in (_FEW_LINES, bands)
+            for lines in (len(self._nodes), bands)
         )
         if few is not None:
             return Way.BETWEEN_FEW, few
-        if _BESIDE * psfs <= _FEW_LINES:
+        if _BESIDE * psfs <= len(self._nodes):
             return Way.BESIDE_FEW, 1.0
         return (Way.LINES, 1.0) if every is None else (Way.BETWEEN_ALL, every)
 
@@ -162,7 +167,7 @@ class Transfers:
         shares = imaging.shares(wavelengths, deep=self.deep)
         nodes = wavelengths
         if way is Way.BETWEEN_FEW or (way is Way.BESIDE_FEW and shares is None):
-            nodes = _ends_and_between(wavelengths, _FEW_LINES)
+            nodes = self._nodes
         elif way is not Way.BETWEEN_ALL:
             nodes = groups
         if not set(groups.tolist()) <= set(nodes.tolist()):
