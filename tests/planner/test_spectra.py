@@ -7,6 +7,7 @@ import math
 import random
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import scipy
@@ -1127,3 +1128,27 @@ def test_many_distances_are_a_ramp(count: int, own: bool) -> None:
         (layers,) = (ladder for ladder in planner._ways()[0] if ladder.effect == "depth")
     assert layers.levels[-1].fineness == count
     assert layers.successive != own
+
+
+@pytest.mark.parametrize(
+    "seed", [n if n in (136, 174) else pytest.param(n, marks=pytest.mark.slow) for n in (136, 174, 224, 51, 37, 102)]
+)
+def test_one_plane_for_two_far_distances_is_not_looked_at(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Because it errs more than there may be, as the picture says."""
+    camera, scene, *_ = random_pair(seed)
+    asked = []
+    error = Evaluator.error
+
+    def watched(self: Evaluator, changes: dict[str, Any], against: dict[str, Any], *care: Any) -> float:
+        asked.append(changes.get("layers"))
+        return error(self, changes, against, *care)
+
+    monkeypatch.setattr(Evaluator, "error", watched)
+    with torch.no_grad():
+        plan = Planner(camera, scene, one=True).plan(0.01)
+        assert asked
+        assert 1 not in asked
+        beside = {"bands": 1, "kappa": 1.5}
+        one, every = (with_imaging(noiseless_raw(camera), **beside, **own)(scene) for own in ({"layers": 1}, {}))
+    assert relative_rms(one, every) > 0.01
+    assert "would cost" in next(row.why for row in plan.decisions if row.effect == "depth")
