@@ -340,9 +340,10 @@ class Spectra:
         # layers lie between others, and windows cut the same off all of them: 1.0 to 1.2 times the truth, measured
         corners = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
         colours = not _differ(changes, against, LINEAR - COLOURS)
-        factor = torch.tensor(corners * more, dtype=torch.float64)
+        factor = torch.tensor(corners, dtype=torch.float64)
         if colours:
-            factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours * more)
+            factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
+        factor = factor * more
         if _differ(changes, against, {"interpolate_bands"}):
             factor = factor * self.optics.between_psfs
         if PARAXIAL.items() <= changes.items() and PARAXIAL.items() <= against.items():
