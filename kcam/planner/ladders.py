@@ -150,7 +150,7 @@ class _View:
         planes, self.vergences, _ = evaluator.laid_out(imaging, scene)
         self.dtype = planes.dtype
         depth = torch.as_tensor(scene.depth, dtype=torch.float64)
-        self.layers = len(imaging.vergences(scene, depth)) if depth.numel() else 1
+        self.layers = len(imaging.vergences(scene, depth)) if depth.ndim > 1 else 1  # a distance per item is no choice
         self.bands = min(imaging.accuracy.bands or len(scene.wavelengths), len(scene.wavelengths))
         self.window = imaging.psf_window(scene.wavelengths, vergences=self.vergences, picture=scene.shape[1:])
         ends = torch.stack([self.vergences.min(), self.vergences.max()])

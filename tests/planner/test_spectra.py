@@ -1130,6 +1130,23 @@ def test_many_distances_are_a_ramp(count: int, own: bool) -> None:
     assert layers.successive != own
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_distance_of_each_item_is_no_choice(seed: int) -> None:
+    """However many there are: an item is rendered at its own, and nothing that is left out would tell of maps."""
+    draw = Draw(seed)
+    count, size = draw.whole(2, 6), draw.whole(20, 40)
+    lens = optics.Lens(optics.CircularAperture(9 * mm), optics.ThinLens(50 * mm), focus_distance=0.5)
+    camera = noiseless_raw(Camera(optics.Imaging(lens, pixel_pitch=4 * um), sensor.ColourFilter.nikon()))
+    light, distances = draw.noise(count, 3, size, size).float(), 0.4 + 3.6 * draw.noise(count)
+    with torch.no_grad():
+        batch = Scene.from_rgb(light, depth=distances)
+        plan = camera.plan(batch, tolerance=0.01)
+        error = plan.measure(camera, batch)
+    assert not {"depth", "occlusion"} & {row.effect for row in plan.decisions}
+    assert not {"layers", "occlusion"} & plan.changes.keys()
+    assert error <= 0.01
+
+
 @pytest.mark.parametrize(
     "seed", [n if n in (136, 174) else pytest.param(n, marks=pytest.mark.slow) for n in (136, 174, 224, 51, 37, 102)]
 )
