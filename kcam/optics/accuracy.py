@@ -25,6 +25,8 @@ OVER_THE_FIELD = ("field_variation", "distortion", "lateral_colour", "relative_i
 
 def check_memory(max_memory: Any) -> None:
     """ValueError for a memory that is not positive, TypeError for what is no number."""
+    if type(max_memory) is float and max_memory > 0:  # a plan changes stages often
+        return
     given = as_numbers(max_memory, name="max_memory", expected="a positive number of bytes")
     if not given > 0:
         raise ValueError(f"max_memory must be a positive number of bytes, got {given:g}.")

@@ -7,7 +7,6 @@ How the picture is convolved stands in `rendering`; here is which PSFs, for whic
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 from collections.abc import Callable
@@ -187,7 +186,7 @@ class Imaging(Stage):
     def _with(self, accuracy: Accuracy) -> Imaging:
         """The same stage, hooks and all, with another accuracy, which has kept nothing."""
         changed = type(self).__new__(type(self))
-        own = {name: copy.copy(value) if isinstance(value, dict | set) else value for name, value in vars(self).items()}
+        own = {name: value.copy() if isinstance(value, (dict, set)) else value for name, value in vars(self).items()}
         own |= {name: ValueCache() for name in ("_bank_cache", "_transfer_cache", "_field_cache", "_known_cache")}
         vars(changed).update(own, accuracy=accuracy)
         if accuracy.propagator is not self.accuracy.propagator:

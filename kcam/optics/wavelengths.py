@@ -21,7 +21,7 @@ def few_wavelengths(wavelengths: Tensor, count: int, *, interpolate: bool) -> tu
     their group's mean wavelength; the larger groups lie at long wavelengths, where a step is less of a fringe.
     """
     nodes, shares = _few(tuple(wavelengths.tolist()), count, interpolate)
-    return torch.tensor(nodes).to(wavelengths), torch.tensor(shares)
+    return nodes.to(wavelengths, copy=True), shares.clone()
 
 
 def chebyshev_wavelengths(wavelengths: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -32,7 +32,8 @@ def chebyshev_wavelengths(wavelengths: Tensor, count: int) -> tuple[Tensor, Tens
 
 
 @functools.lru_cache(maxsize=256)
-def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple[np.ndarray, np.ndarray]:
+@torch.inference_mode(False)
+def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple[Tensor, Tensor]:
     own = np.array(wavelengths)
     low, high = 1 / own.max(), 1 / own.min()
     if not interpolate or low == high:
@@ -41,11 +42,12 @@ def _few(wavelengths: tuple[float, ...], count: int, interpolate: bool) -> tuple
             shares[group, index] = 1
         means = own @ shares / shares.sum(0)
         near = own[np.abs(own - means[:, None]).argmin(1)]
-        return np.where(np.isclose(near, means, rtol=1e-9, atol=0), near, means), shares  # a band is itself
+        means = np.where(np.isclose(near, means, rtol=1e-9, atol=0), near, means)  # a band is itself
+        return torch.from_numpy(means), torch.from_numpy(shares)
     step = (high - low) / count
     place = (1 / own - low) / step - 0.5
     nodes, nearest = np.arange(count, dtype=float), np.abs(place - np.arange(count)[:, None]).argmin(1)
     bands = bool((np.abs(place[nearest] - nodes) <= _NEAR).all())
     nodes = place[nearest] if bands else nodes
-    shares = cubic_weights(torch.tensor(nodes), torch.tensor(place)).numpy()
-    return own[nearest] if bands else 1 / (low + step * (nodes + 0.5)), shares
+    found = own[nearest] if bands else 1 / (low + step * (nodes + 0.5))
+    return torch.from_numpy(found), cubic_weights(torch.from_numpy(nodes), torch.from_numpy(place))

@@ -73,21 +73,8 @@ def samples_of(
     every = [(index, row) for index, found in enumerate(surveys) for row in range(len(found))]
     if not every:
         return []
-    looked_at = [surveys[index][row] for index, row in every]
-    relative = torch.stack([one.relative() for one in looked_at])
-    score = (relative / relative.amax(0).clamp(min=1e-30)).amax(1)
     sizes = [scenes[index].shape[1] * scenes[index].shape[2] for index, _ in every]
-    chosen = list(dict.fromkeys(relative.argmax(0).tolist()))
-    for own in (
-        shares(torch.stack([one.light for one in looked_at])) + COLOUR,
-        shares(torch.stack([one.depths for one in looked_at])) + DEPTH,
-        torch.stack([one.left_out for one in looked_at]) + SPECTRUM,
-    ):
-        while float((more := (own / own[chosen].amax(0)).amax(1)).max()) > math.sqrt(OTHER_LIGHT):
-            chosen.append(int(more.argmax()))
-    for other in score.argsort(descending=True, stable=True).tolist():
-        if other not in chosen and sum(sizes[k] for k in chosen) + sizes[other] <= pixels:
-            chosen.append(other)
+    chosen = _chosen([surveys[index][row] for index, row in every], sizes, pixels) if len(every) > 1 else [0]
     if side is None:
         pixels //= len(chosen)
         side = int((pixels / (len(KINDS) + 2)) ** 0.5)
@@ -103,6 +90,24 @@ def samples_of(
     return samples
 
 
+def _chosen(looked_at: Sequence[Survey], sizes: Sequence[int], pixels: int) -> list[int]:
+    """Of items that were looked over, those that tell of all."""
+    relative = torch.stack([one.relative() for one in looked_at])
+    score = (relative / relative.amax(0).clamp(min=1e-30)).amax(1)
+    chosen = list(dict.fromkeys(relative.argmax(0).tolist()))
+    for own in (
+        shares(torch.stack([one.light for one in looked_at])) + COLOUR,
+        shares(torch.stack([one.depths for one in looked_at])) + DEPTH,
+        torch.stack([one.left_out for one in looked_at]) + SPECTRUM,
+    ):
+        while float((more := (own / own[chosen].amax(0)).amax(1)).max()) > math.sqrt(OTHER_LIGHT):
+            chosen.append(int(more.argmax()))
+    for other in score.argsort(descending=True, stable=True).tolist():
+        if other not in chosen and sum(sizes[k] for k in chosen) + sizes[other] <= pixels:
+            chosen.append(other)
+    return chosen
+
+
 def _sample(
     scene: Scene, surveys: Sequence[Survey], rows: Sequence[int], *, first: int, side: int, pixels: int
 ) -> Sample:
@@ -112,10 +117,32 @@ def _sample(
     By gain x potential the error of the crops stands for that of the scene, relative to what is recorded of it.
     """
     _, height, width = scene.shape
-    crops: list[tuple[int, int, int]] = []
-    factors = {}
-    blur = max(float(surveys[row].blur.max()) for row in rows)
-    extent = side + 2 * math.ceil(blur)
+    whole = height * width <= pixels
+    if not whole:
+        extent = side + 2 * math.ceil(max(float(surveys[row].blur.max()) for row in rows))
+        size = {"height": min(extent, height), "width": min(extent, width)}
+        crops, factors = _crops(surveys, rows, extent, (height, width))
+        whole = len(rows) * height * width <= len(crops) * math.prod(size.values())
+    if whole:
+        own = scene if len(rows) == len(surveys) else scene.samples(rows)
+        return Sample(own, tuple(first + row for row in rows), (1.0,) * len(rows), None, (height, width), scene)
+    part = [scene.crop(top=top, left=left, **size).samples([row]) for row, top, left in crops]
+    maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
+    depth: float | Tensor = scene.depth
+    if isinstance(depth, Tensor):  # maps, or numbers of one per sample
+        depth = torch.cat(maps) if maps else torch.tensor([one.depth for one in part], dtype=torch.float64)
+    together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
+    owners, own_factors = tuple(first + row for row, _, _ in crops), tuple(factors[row] for row, _, _ in crops)
+    middle = (together.shape[2] - width) / 2, (together.shape[1] - height) / 2
+    places = tuple((left + middle[0], top + middle[1]) for _, top, left in crops)
+    return Sample(together, owners, own_factors, places, (height, width), scene)
+
+
+def _crops(
+    surveys: Sequence[Survey], rows: Sequence[int], extent: int, picture: tuple[int, int]
+) -> tuple[list[tuple[int, int, int]], dict[int, float]]:
+    """Of an extent: (row, top, left) of each, and the factor of each row's."""
+    crops, factors = [], {}
     for row in rows:
         found = surveys[row]
         ends = [1e9 - found.far, found.near] if float(found.near.max()) > float(found.far.min()) else []
@@ -124,29 +151,13 @@ def _sample(
         for kind in [*kinds, *ends]:
             tile = divmod(int(kind.argmax()), kind.shape[1])
             if not seen.any() or (bool(kind.any()) and not bool(seen[tile])):
-                top, of_rows = _window(tile[0], len(kind), extent, height)
-                left, of_columns = _window(tile[1], kind.shape[1], extent, width)
+                top, of_rows = _window(tile[0], len(kind), extent, picture[0])
+                left, of_columns = _window(tile[1], kind.shape[1], extent, picture[1])
                 seen |= of_rows[:, None] & of_columns
                 crops.append((row, top, left))
         covered = [float(kind[seen].sum() / kind.sum()) for kind in kinds if kind.any()]
         factors[row] = math.sqrt(covered[-1] / min(covered)) if covered else 1.0
-    size = {"height": min(extent, height), "width": min(extent, width)}
-    if height * width <= pixels or len(rows) * height * width <= len(crops) * size["height"] * size["width"]:
-        part = [scene.samples([row]) for row in rows]
-        crops, factors = [(row, 0, 0) for row in rows], dict.fromkeys(rows, 1.0)
-    else:
-        part = [scene.crop(top=top, left=left, **size).samples([row]) for row, top, left in crops]
-    maps = [one.depth for one in part if isinstance(one.depth, Tensor)]
-    depth: float | Tensor = scene.depth
-    if isinstance(depth, Tensor):  # maps, or numbers of one per sample
-        depth = torch.cat(maps) if maps else torch.tensor([one.depth for one in part], dtype=torch.float64)
-    together = replace(scene, coefficients=torch.cat([one.coefficients for one in part]), depth=depth)
-    owners = tuple(first + row for row, _, _ in crops)
-    places = None
-    if together.shape[1:] != (height, width):
-        middle = (together.shape[2] - width) / 2, (together.shape[1] - height) / 2
-        places = tuple((left + middle[0], top + middle[1]) for _, top, left in crops)
-    return Sample(together, owners, tuple(factors[row] for row, _, _ in crops), places, (height, width), scene)
+    return crops, factors
 
 
 def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:

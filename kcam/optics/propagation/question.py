@@ -175,7 +175,8 @@ class Query:
     def scale(self) -> tuple[float, float]:
         """(a', d) as numbers [m], without a gradient; kept, because sampling rules ask for it at each wavelength."""
         with torch.no_grad():  # a checkpoint that computes again must find the same graph
-            return float(self.image_side_semi_aperture), float(self.sensor_distance)
+            a, d = float(self.semi_aperture), float(self.sensor_distance)
+        return a if self.paraxial else a / math.sqrt(1 + (a / d) ** 2), d
 
     @functools.cached_property
     def has_pixels(self) -> bool:

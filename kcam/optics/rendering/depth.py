@@ -105,8 +105,8 @@ def places(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> lis
         filled = torch.zeros(*own.shape[:2], layers.numel(), dtype=torch.bool, device=own.device)
         for one in (own.floor(), own.ceil()):
             filled.scatter_(-1, one.long(), True)
-        sides.append(filled.cpu())
-    return [Place.of(*(side[..., layer] for side in sides)) for layer in range(layers.numel())]
+        sides.append(filled)
+    return Place.of(*sides)
 
 
 def warn_of_few(layers: object, nodes: Tensor, *, vergence: Tensor, defocus_waves: float) -> None:
@@ -170,8 +170,7 @@ class Layers:
         """Where each layer is; None where a derivative goes through what is empty, too, or nothing is computed yet."""
         if self.shares is None or not is_plain(self.shares):
             return None
-        sides = ((self.shares.amax(dim) > 0).movedim(1, 0).cpu() for dim in (-1, -2))
-        return [Place.of(*both) for both in zip(*sides, strict=True)]
+        return Place.of(*((self.shares.amax(dim) > 0).mT for dim in (-1, -2)))
 
     def _lay(self, place: Place, renderer: Renderer, layer: int, masks: list[Tensor]) -> None:
         """Lay a layer over the part of the picture that it reaches."""
