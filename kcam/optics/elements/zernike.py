@@ -10,6 +10,7 @@ from torch import Tensor
 from kcam.optics.elements.element import Element, Term, check_vector, set_tensor
 from kcam.optics.numerics import float64
 from kcam.optics.pupil.coordinates import Pupil
+from kcam.optics.pupil.quadrants import of_parities
 
 
 class ZernikeAberration(Element):
@@ -53,11 +54,13 @@ def zernike_sum(coefficients: Tensor, pupil: Pupil) -> Tensor:
     """sum_j c_j Z_j over the pupil, Noll-normalised (unit variance on the unit circle), float64.
 
     Z = sqrt(n + 1) [sqrt 2] rho^|m| R'(rho^2) cos or sin(m theta), with rho^|m| exp(i m theta) = (x + iy)^|m|: a
-    polynomial, so value and gradient are finite on the axis.
+    polynomial, so value and gradient are finite on the axis. Cosines are even in y, and in x where m is; sines are odd
+    in y, and in x where m is even: of a mirrored pupil one quadrant does.
     """
-    rho2 = pupil.rho2
-    x, y = torch.broadcast_tensors(pupil.x, pupil.y)
-    powers, total = (torch.ones_like(rho2), torch.zeros_like(rho2)), torch.zeros_like(rho2)
+    part, rho2 = pupil.quadrant or pupil, pupil.rho2
+    x, y = torch.broadcast_tensors(part.x, part.y)
+    powers = torch.ones_like(rho2), torch.zeros_like(rho2)
+    total = {(False, False): torch.zeros_like(rho2)}  # by whether it is odd in x, and in y
     every = float64(coefficients).to(rho2.device).unbind()
     indices = [noll_indices(index + 1) for index in range(len(every))]
     for order in range(1 + max((abs(m) for _, m in indices), default=-1)):
@@ -70,8 +73,11 @@ def zernike_sum(coefficients: Tensor, pupil: Pupil) -> Tensor:
                 radial, *others = _radial(own, order)
                 for coefficient in others:
                     radial = torch.addcmul(coefficient, radial, rho2)
-                total = torch.addcmul(total, radial, power)
-    return total
+                odd = (order % 2 == (sign > 0), sign < 0) if part is pupil.quadrant else (False, False)
+                before = total.get(odd)
+                total[odd] = radial * power if before is None else torch.addcmul(before, radial, power)
+    even, rest = total[False, False], [total.get(odd) for odd in ((True, False), (False, True), (True, True))]
+    return even if all(part is None for part in rest) else of_parities(even, *rest)
 
 
 def _radial(own: Sequence[tuple[int, Tensor]], order: int) -> list[Tensor]:

@@ -22,7 +22,7 @@ from kcam.optics.propagation.pixels import Pixels
 from kcam.optics.propagation.radial import KEPT, even_between, hankel_kernel
 from kcam.optics.propagation.transforms import MatrixTransform
 from kcam.optics.pupil.coordinates import Pupil, grid_nodes, grid_spacing
-from kcam.optics.pupil.quadrants import unfold
+from kcam.optics.pupil.quadrants import split
 from kcam.optics.pupil.rim import disc_weights
 from kcam.units import check_pixel_pitch, check_positive, wavelength_grid
 
@@ -166,7 +166,7 @@ def _aberrated(
     nodes = grid_nodes(count)
     like = torch.empty(0, dtype=dtype, device=device)
     wavenumbers = (2 * math.pi / grid).to(device)
-    weights = unfold(disc_weights(count, spacing=grid_spacing(count))).to(device)
+    weights = disc_weights(count, spacing=grid_spacing(count)).to(device)
     scales = wavenumbers * (a / d)
     intensity = pupil_intensity(
         (wavenumbers[:, None, None] * opd).to(dtype),
@@ -180,7 +180,7 @@ def _aberrated(
         nodes=nodes,
         points=torch.arange(-reach, reach + 1, dtype=torch.float64) * step,
     )
-    area = grid_spacing(count) ** 2 / float(weights.sum())
+    area = grid_spacing(count) ** 2 / (4 * float(weights.sum()))
     factor = area * (a * pixel_pitch / (grid.to(device) * d)) ** 2  # (L,)
     pixels = Pixels(shape, per_pixel).of_quadrants(intensity)
     return (pixels * factor[:, None, None, None].to(dtype)).transpose(0, 1)
@@ -208,7 +208,7 @@ def _zernike_slopes(terms: int) -> tuple[Tensor, Tensor]:
 @functools.lru_cache(maxsize=16)  # 13 MB for 15 terms on 448 nodes
 @torch.inference_mode(False)
 def _pupil_maps(count: int, terms: int, dtype: torch.dtype) -> Tensor:
-    return _zernike_maps(grid_nodes(count), terms).to(dtype)
+    return split(_zernike_maps(grid_nodes(count), terms)).to(dtype)
 
 
 def _radial_bank(

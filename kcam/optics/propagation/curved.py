@@ -109,8 +109,8 @@ class CurvedTransform:
     def disarrange(self, maps: Tensor) -> Tensor:
         return self.inner.disarrange(maps)
 
-    def arrange_even(self, quadrant: Tensor) -> Tensor:
-        return self.inner.arrange_even(quadrant)
+    def arrange_quadrants(self, maps: Tensor) -> Tensor:
+        return self.inner.arrange_quadrants(maps)
 
     def arrange_points(self, image: Tensor) -> Tensor:
         return self.inner.arrange_points(image)

@@ -22,7 +22,6 @@ from kcam.optics.propagation.question import Query, residual_amplitude, residual
 from kcam.optics.propagation.row import FFT_SLOWNESS, PRODUCTS, Propagator
 from kcam.optics.propagation.transforms import ChirpZTransform, FFTTransform, MatrixTransform, Transform
 from kcam.optics.pupil.coordinates import EDGE_MARGIN, from_image_side, grid_nodes, grid_spacing, to_image_side
-from kcam.optics.pupil.quadrants import unfold
 from kcam.optics.pupil.rim import round_weights
 from kcam.optics.pupil.warp import Warp
 
@@ -143,17 +142,17 @@ def _grid_group(query: Query, members: list[int], *, count: int, per_pixel: floa
     if curved:
         kernels = _curve(query, kernels, scales, nodes, step=step, reach=reach, like=like)
 
-    along = (nodes[count // 2 :] if query.even else nodes).to(query.device)
+    along = nodes[count // 2 :].to(query.device)
     x, y = along[None, :], along[:, None]
     pupil = query.pupil(*((x, y) if curved else from_image_side(x, y, query.tau)))
-    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), pupil)
+    seen = pupil if query.even else pupil.mirrored()
+    coefficients, maps = residual_path(replace(query, wavelengths=query.wavelengths[members]), seen)
     amplitude = residual_amplitude(query, pupil, curved=curved)
     cell_area = (semi_aperture * spacing) ** 2
     cells = Cells.of(query, wavelengths, count=count, spacing=spacing)
     if cells is None:
-        quadrant = _disc_weights(query, count=count, spacing=spacing)
-        weights, share = (quadrant, 4) if query.even else (unfold(quadrant), 1)
-        energy = share * (weights * amplitude**2).sum((-2, -1)) * cell_area
+        weights = _disc_weights(query, count=count, spacing=spacing)
+        energy = 4 * (weights * amplitude**2).sum((-2, -1)) * cell_area
         amplitude, field = weights * amplitude, None
     else:  # they hold the aperture, for its rim cuts their pixels
         energy = cells.energy(query.semi_aperture, 0 * query.vergences[:1] if query.paraxial else query.vergences)

@@ -130,8 +130,8 @@ def pupil_intensity(
 
     Args:
         coefficients: (G, Z, T) of the phase's maps [rad per unit of the map]; G groups share a kernel.
-        maps: (T, N, N), or for x, y > 0 alone where all are even, (T, N / 2, N / 2).
-        amplitude: (1 or Z, ...) likewise, quadrature weights included.
+        maps: of the quadrants of the grid, see `Pupil.mirrored`: (T, 4, N / 2, N / 2), or (T, N / 2, N / 2) where all
+            are even. amplitude: even (1 or Z, N / 2, N / 2), quadrature weights included.
         field: real and imaginary part of what does not fit into a phase (a low-passed pixel map), (2, G, ...) in the
             transforms' layout, or None.
         scales: (G,) kernel scales s [1/m], for their gradient. transforms: one for each group, built with that scale.
@@ -141,9 +141,8 @@ def pupil_intensity(
         (G, Z, ...) in the transforms' layout, for `to_pixels`; differentiable once in all tensors.
     """
     layout = transforms[0]
-    maps, amplitude = (
-        layout.arrange(m) if m.shape[-1] == nodes.numel() else layout.arrange_even(m) for m in (maps, amplitude)
-    )
+    maps = layout.arrange_quadrants(maps if maps.ndim == 4 else maps.unsqueeze(1))
+    amplitude = layout.arrange_quadrants(amplitude.unsqueeze(1))
     with full_precision(coefficients.device):
         curvature = torch.zeros_like(scales[0]) if tau is None else tau.to(scales)
         return _PupilIntensity.apply(coefficients, maps, amplitude, field, scales, curvature, transforms, nodes, points)

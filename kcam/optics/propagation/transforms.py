@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kcam.optics.numerics import Pair, fast_length, phasor
 from kcam.optics.propagation.pixels import Pixels
-from kcam.optics.pupil.quadrants import by_x, join, parities, split, unfold
+from kcam.optics.pupil.quadrants import by_x, join, parities, split
 
 
 class Transform(Protocol):
@@ -30,8 +30,8 @@ class Transform(Protocol):
     def disarrange(self, maps: Tensor) -> Tensor:
         """The inverse of `arrange`, and its transpose."""
 
-    def arrange_even(self, quadrant: Tensor) -> Tensor:
-        """Maps that are even in x and y, given for x, y > 0 (..., N / 2, N / 2); broadcastable to the layout."""
+    def arrange_quadrants(self, maps: Tensor) -> Tensor:
+        """The same of their quadrants (..., 4 or 1, N / 2, N / 2), broadcastable: of one, where all are alike."""
 
     def forward(self, pupil: Pair) -> Pair:
         """Field on the points, up to a phase that |U|^2 does not see."""
@@ -70,8 +70,8 @@ class MatrixTransform:
     def disarrange(self, maps: Tensor) -> Tensor:
         return join(maps, odd=False)
 
-    def arrange_even(self, quadrant: Tensor) -> Tensor:
-        return quadrant.unsqueeze(-3)
+    def arrange_quadrants(self, maps: Tensor) -> Tensor:
+        return maps
 
     def forward(self, pupil: Pair) -> Pair:
         batch, _, n, _ = pupil[0].shape
@@ -144,8 +144,8 @@ class PlainLayout:
 
     disarrange = arrange_points = arrange
 
-    def arrange_even(self, quadrant: Tensor) -> Tensor:
-        return unfold(quadrant)
+    def arrange_quadrants(self, maps: Tensor) -> Tensor:
+        return join(maps.expand(*maps.shape[:-3], 4, -1, -1), odd=False)
 
     def to_pixels(self, intensity: Tensor, pixels: Pixels) -> Tensor:
         return pixels.of_image(intensity)

@@ -12,11 +12,13 @@ edges would be curved there, are sampled in the true plane; `CurvedTransform` th
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from kcam.optics.pupil.quadrants import signs
 
 EDGE_MARGIN = 12  # samples of the grid beyond the rim, where low-passed edges still differ from zero
 
@@ -30,6 +32,7 @@ class Pupil:
     sensor_distance:  d [m], likewise.
     paraxial:         True where the Fresnel approximation holds by definition of the model.
     round:            True where no light passes beyond rho = 1.
+    quadrant:         of points that are mirrored, the first of the four; the others have the same radii.
     """
 
     x: Tensor
@@ -38,10 +41,20 @@ class Pupil:
     sensor_distance: Tensor
     paraxial: bool
     round: bool = False
+    quadrant: Pupil | None = None
+
+    def mirrored(self) -> Pupil:
+        """That of points of one quadrant in all four, x and y (4, ...) in the order of `quadrants`: what depends on the
+        radius alone is that of one.
+        """
+        across, down = signs(self.x)
+        return replace(self, x=across * self.x, y=down * self.y, quadrant=self)
 
     @functools.cached_property
     def rho2(self) -> Tensor:
         """Squared normalised radius; kept squared, because sqrt has no gradient at 0."""
+        if self.quadrant is not None:
+            return self.quadrant.rho2
         return self.x.square() + self.y.square()
 
     @property

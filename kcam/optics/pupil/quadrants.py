@@ -12,6 +12,12 @@ import torch
 from torch import Tensor
 
 
+def signs(like: Tensor) -> tuple[Tensor, Tensor]:
+    """Of x, and of y, in each quadrant, (4, 1, 1) each."""
+    x, y = like.new_tensor([[1, -1, 1, -1], [1, 1, -1, -1]])[..., None, None]
+    return x, y
+
+
 def split(grid: Tensor) -> Tensor:
     """Quadrants (..., 4, h, w) of a grid (..., H, W), h = ceil(H / 2)."""
     rows, columns = grid.shape[-2:]
@@ -56,6 +62,16 @@ def parities(quadrants: Sequence[Tensor], out: Sequence[Tensor]) -> None:
     torch.sub(c, d, out=right)
     torch.add(left, right, out=out[1])
     torch.sub(left, right, out=out[3])
+
+
+def of_parities(even: Tensor, odd_x: Tensor | None, odd_y: Tensor | None, odd: Tensor | None) -> Tensor:
+    """Quadrants (..., 4, h, w) of a sum of what is even, odd in x, in y and in both, given for x, y > 0; with a
+    derivative.
+    """
+    zero = torch.zeros_like(even)
+    b, c, d = (zero if part is None else part for part in (odd_x, odd_y, odd))
+    (left, turned), (right, other) = ((first + second, first - second) for first, second in ((even, b), (c, d)))
+    return torch.stack([left + right, turned + other, left - right, turned - other], dim=-3)
 
 
 def by_x(quadrants: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
