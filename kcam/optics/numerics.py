@@ -105,10 +105,11 @@ def bracketed(nodes: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
 
     Values beyond the outermost nodes belong to the first or the last two, with shares below 0 or above 1.
     """
-    before = torch.searchsorted(nodes.detach(), at.detach().contiguous(), right=True) - 1
-    before = before.clamp(0, len(nodes) - 2)
-    low, high = nodes[before], nodes[before + 1]
-    return before, (at - low) / (high - low)
+    before = torch.bucketize(at.detach().contiguous(), nodes.detach()[1:-1], right=True)
+    low, step = nodes[:-1], nodes.diff()
+    if len(step) > 1:
+        low, step = (values.index_select(0, before.flatten()).view(at.shape) for values in (low, step))
+    return before, (at - low) / step
 
 
 def linear_weights(nodes: Tensor, at: Tensor) -> Tensor:

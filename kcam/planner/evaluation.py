@@ -130,7 +130,7 @@ class Evaluator:
             narrow = [window for one in self.spectra if (window := one.narrow(few, LOOKED))]
             if narrow and len(narrow) == len(self.spectra):
                 few |= {"psf_shape": max(narrow), "renormalise": True}
-        self.signals = self._signals(few)
+        self.signals = self._signals(few | {"precision": "float32"})  # which holds what is bright
         self.lost = self._cut_off()
         if self.spectra and not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
             self.spectra = None

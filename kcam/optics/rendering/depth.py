@@ -17,16 +17,20 @@ from kcam.optics.rendering.renderer import Renderer
 from kcam.scene import Scene
 
 LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
+_COMPARED = 16  # different values, of which each pixel is told by comparing; with more sorting takes less time
 _COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
 
 
 def few_values(values: Tensor, *, at_most: int) -> Tensor | None:
     """The different values, ascending, or None where there are more of them."""
     flat = values.flatten()
-    sample = flat[:: max(1, flat.numel() // 4096)]  # tells a ramp from planes without sorting all pixels
-    if sample.unique().numel() > at_most:
+    found = flat[:: max(1, flat.numel() // 4096)].unique()  # tells a ramp from planes without sorting all pixels
+    if found.numel() > at_most:
         return None
-    found = flat.unique()
+    if found.numel() > _COMPARED:
+        found = flat.unique()
+    elif bool((other := functools.reduce(torch.logical_and, (flat != one for one in found))).any()):
+        found = torch.cat([found, flat[other]]).unique()
     return found if found.numel() <= at_most else None
 
 
@@ -80,15 +84,18 @@ def alike(scene: Scene) -> list[Tensor]:
     return [torch.tensor(rows) for rows in groups.values()]
 
 
-def layer_shares(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> Tensor:
+def layer_shares(
+    vergence: Tensor, layers: Tensor, *, interpolate: bool = True, dtype: torch.dtype = torch.float64
+) -> Tensor:
     """Share of each pixel in each layer of a map: linear between neighbours, or all in the nearest.
 
     Args:      vergence: (B, 1, H, W) [1/m]; beyond the layers all is in the last. layers: (Z,) ascending, Z > 1 [1/m].
+               dtype: of the shares.
     Returns:   (B, Z, H, W), sums to 1 over the layers.
     """
     position = _positions(vergence, layers, interpolate=interpolate)
-    index = torch.arange(layers.numel(), device=vergence.device, dtype=torch.float64)
-    return torch.clamp(1 - (position - index[:, None, None]).abs(), min=0)
+    shares = [torch.clamp(1 - (position - layer).abs(), min=0).to(dtype) for layer in range(layers.numel())]
+    return torch.cat(shares, dim=1)  # one by one they stay near the processor: all at once take five times as long
 
 
 def _positions(vergence: Tensor, layers: Tensor, *, interpolate: bool) -> Tensor:
