@@ -433,8 +433,7 @@ class Imaging(Stage):
             warn_of_few(self.accuracy.layers, vergences, vergence=1 / depth, defocus_waves=waves)
         if vergences.numel() == 1:
             return vergences, None
-        how = {"interpolate": self.accuracy.interpolate, "dtype": planes.dtype}
-        shares = layer_shares(1 / depth, vergences, **how)
+        shares = layer_shares(1 / depth, vergences, interpolate=self.accuracy.interpolate, dtype=planes.dtype)
         filled = shares.detach().amax((0, 2, 3)) > 0
         return vergences[filled.to(vergences.device)], shares[:, filled]
 

@@ -142,7 +142,8 @@ class Spectra:
             return False
         if bool(cut.any()):
             every = {**settings, "bands": None}
-            said = torch.where(cut, self._whole(every, Way.LINES), said)
+            way = Way.BETWEEN_FEW if self.by_lines(every) else Way.LINES
+            said = torch.where(cut, self._whole(every, way), said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
         return True
 

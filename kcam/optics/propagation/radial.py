@@ -124,7 +124,7 @@ class RadialTransfer:
         step, kappa = self.step[chosen], self.kappa[chosen]
         end = min(self.light.shape[-1], math.ceil(math.hypot(*shape) / 2 / float(step.detach().min())) + 1)
         inside = _share_inside(shape, torch.arange(end, device=step.device) * step[:, None])
-        table = (self.light[chosen, :, :end] * inside[:, None]) @ self.kernel[:end]  # (L, Z, K)
+        table = ((self.light[chosen, :, :end] * inside[:, None].float()) @ self.kernel[:end]).double()  # (L, Z, K)
         cutoff = (self.kernel.shape[-1] - 1) / float(kappa.detach().min())
         index, asked, weights = sampling.folded(frequencies, cutoff, self.active)
         place = (kappa[:, None] * asked.abs()).clamp(max=table.shape[-1] - 1)  # beyond 2 there is nothing
@@ -172,7 +172,7 @@ def radial_transfer(query: Query) -> RadialTransfer:
     light = intensity * weights
     count = max(_FEWEST, _EVEN * math.ceil(len(t) / _EVEN))  # as many as there are t: two for each fringe
     return RadialTransfer(
-        light=light / (2 * math.pi * energy[:, None]),
+        light=(light / (2 * math.pi * energy[:, None])).float(),
         kernel=_even_kernel(count, step=step * 2 / (count - 1), device=query.device)[: len(t)],
         step=step / (scales * pitch),
         kappa=wavelengths * d / (a * pitch) * ((count - 1) / 2),
@@ -228,18 +228,18 @@ def hankel_kernel(rho: Tensor, steps: int, *, step: float) -> Tensor:
 
 
 def _even_kernel(count: int, *, step: float, device: torch.device) -> Tensor:
-    """J0(i j step), (count, count), of which half is computed: `hankel_kernel` of even radii."""
+    """J0(i j step), (count, count) in float32, of which half is computed: `hankel_kernel` of even radii."""
 
     def build() -> Tensor:
-        table = torch.empty(count, count, dtype=torch.float64, device=device)
+        table = torch.empty(count, count, dtype=torch.float32, device=device)
         numbers = torch.arange(count, dtype=torch.float64, device=device)
         for first in range(0, count, _EVEN):
             rows = slice(first, first + _EVEN)
-            table[rows, first:] = BesselJ0.apply(numbers[rows, None] * numbers[first:] * step)
+            table[rows, first:] = BesselJ0.apply(numbers[rows, None] * numbers[first:] * step).float()
             table[first:, rows] = table[rows, first:].T
         return table
 
-    return build() if count**2 > KEPT else _KERNELS.get((count, step, device), build)
+    return build() if count**2 > 2 * KEPT else _KERNELS.get((count, step, device), build)  # half the bytes
 
 
 def hankel(field: Tensor, steps: int, rho: Tensor, *, finer: int) -> Tensor:

@@ -15,6 +15,7 @@ import scipy
 import torch
 from torch import Tensor
 
+from kcam.cache import ValueCache
 from kcam.optics.numerics import legendre, phasor
 
 _MOST_PANELS = 2**14
@@ -25,6 +26,7 @@ _LOOKED_AT = 2**16  # places along the radius at which narrow structure is looke
 _BEND = 1e-3  # between three of these: what is bent more, nodes of a wide panel may not see [rad]
 _MOST_SPECTRUM = 2**17  # samples of a radius
 _TURNS = 200  # of a kernel, that the polynomials of one part of the radius follow
+_POLYNOMIALS = ValueCache(2)  # the last of these at the nodes: other distances have the same nodes
 
 
 def panels_of(phase: Callable[[Tensor], Tensor], knots: Tensor, *, first: int = 32) -> Tensor:
@@ -109,16 +111,21 @@ def fewer_nodes(values: Tensor, nodes: Tensor, *, frequency: float) -> tuple[Ten
     count = math.ceil(turns + min(48, 12 + 8 * turns ** (1 / 3)))
     if 1.5 * count * parts > nodes.numel() or nodes.requires_grad:
         return values, nodes
-    inside = (nodes - low) * (parts / (1 - low))
-    part = inside.long().clamp(max=parts - 1)
     places, weights = legendre(count)
     coarse = np.polynomial.legendre.legvander(places, count - 1)
     back = torch.as_tensor(coarse.T * weights * (np.arange(count)[:, None] + 0.5)).to(nodes)
-    projected = []
-    for own in range(parts):
-        chosen = (part == own).nonzero()[:, 0]
-        fine = np.polynomial.legendre.legvander((2 * (inside[chosen] - own) - 1).cpu().numpy(), count - 1)
-        projected.append(values[..., chosen] @ torch.as_tensor(np.ascontiguousarray(fine)).to(nodes) @ back)
+
+    def polynomials() -> tuple[tuple[Tensor, Tensor], ...]:
+        inside = (nodes - low) * (parts / (1 - low))
+        part, found = inside.long().clamp(max=parts - 1), []
+        for own in range(parts):
+            chosen = (part == own).nonzero()[:, 0]
+            fine = np.polynomial.legendre.legvander((2 * (inside[chosen] - own) - 1).cpu().numpy(), count - 1)
+            found.append((chosen, torch.as_tensor(np.ascontiguousarray(fine)).to(nodes)))
+        return tuple(found)
+
+    kept = _POLYNOMIALS.get((nodes, parts, count), polynomials)
+    projected = [values[..., chosen] @ fine @ back for chosen, fine in kept]
     starts = torch.arange(parts, dtype=nodes.dtype, device=nodes.device)[:, None]
     fewer = (torch.as_tensor(places).to(nodes) + 1) / 2 + starts
     return torch.cat(projected, dim=-1), low + (1 - low) / parts * fewer.flatten()
