@@ -368,8 +368,8 @@ class Spectra:
             return Way.PSFS, 1.0
         if care is Care.AT_FIRST:
             return Way.WHOLE_LINES, 1.0
-        if _differ(changes, against, COLOURS) and self.by_lines(against):
-            return self.optics.between(changes.get("bands"))
+        if _differ(changes, against, COLOURS) and self.tabled(against):
+            return self.optics.between(changes.get("bands"), lines=self.by_lines(against))
         return Way.LINES, 1.0
 
     @functools.cached_property

@@ -23,7 +23,7 @@ from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.propagation.sampling import along_axis
 from kcam.optics.source import Defocus, Points
-from kcam.planner.band_counts import FEW_BANDS, group_counts, interpolated, node_counts
+from kcam.planner.band_counts import FEW_BANDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
 
@@ -41,6 +41,7 @@ _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the pi
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
 _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
 # would be told too little without; few lights may fall into a corner
+_ASKED = (1, FEW_BANDS, ROUND)  # groups of wavelengths, beside which other choices than these are priced
 _SMOOTH, _SMOOTH_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
 # slices tell of a PSF, and of a map of pixels, of which only some rows are looked at: 0.75 to 1.24 times the truth of
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
@@ -140,22 +141,30 @@ class Transfers:
         return self._unions[key]
 
     @functools.cached_property
+    def _usual(self) -> Tensor:
+        """All bands, between which others lie, and the few that are asked for beside them."""
+        few = [self.stage({"bands": count}).psf_wavelengths(self.wavelengths, deep=self.deep) for count in _ASKED]
+        return torch.cat([self.wavelengths, *few]).unique()
+
+    @functools.cached_property
     def _nodes(self) -> Tensor:
         """Of all bands, those between whose line spreads those of others lie."""
         return _ends_and_between(self.wavelengths, _FEW_LINES)
 
-    def between(self, psfs: int | None) -> tuple[Way, float]:
-        """How line spreads tell what so many PSFs for all wavelengths cost, and times the error that they tell."""
+    def between(self, psfs: int | None, *, lines: bool) -> tuple[Way, float]:
+        """How line spreads, or else tables of all bands, tell what so many PSFs for all wavelengths cost, and times the
+        error that they tell.
+        """
         bands = len(self.wavelengths)
         if psfs is None or bands <= _FEW_LINES:
             return Way.LINES, 1.0
         few, every = (
-            next((factor for each, factor in _BETWEEN.items() if each * psfs <= lines), None)
-            for lines in (len(self._nodes), bands)
+            next((factor for each, factor in _BETWEEN.items() if each * psfs <= known), None)
+            for known in (len(self._nodes) if lines else 0, bands)
         )
         if few is not None:
             return Way.BETWEEN_FEW, few
-        if _BESIDE * psfs <= len(self._nodes):
+        if lines and _BESIDE * psfs <= len(self._nodes):
             return Way.BESIDE_FEW, 1.0
         return (Way.LINES, 1.0) if every is None else (Way.BETWEEN_ALL, every)
 
@@ -322,7 +331,7 @@ class Transfers:
     def table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, grey: bool = False) -> Table | None:
         """Transfer functions of these wavelengths and others, where optics know them without PSFs.
 
-        Of many layers, and in grey light, a few wavelengths have a table, else all for which PSFs may stand. One layer
+        Of many layers, and in grey light, a few wavelengths have a table, else all that are usually asked for. One layer
         of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
         """
         if self.folded_across:
@@ -341,9 +350,8 @@ class Transfers:
         if not self._tabled[propagator]:
             return None
         few = grey or len(vergences) > _FEW_LAYERS
-        sets = [self._every_and(wavelengths)]
-        if set(wavelengths.tolist()) <= set(self.few.tolist()):
-            sets.append(self.few)
+        asked = set(wavelengths.tolist())
+        sets = [some for some in (self._usual, self.few) if asked <= set(some.tolist())] or [wavelengths]
         keys = [(propagator, window, tuple(vergences.tolist()), tuple(some.tolist())) for some in sets]
         if (found := next((self._tables[key] for key in keys if key in self._tables), None)) is not None:
             return found
