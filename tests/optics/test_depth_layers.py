@@ -14,7 +14,8 @@ from torch import Tensor
 
 from kcam import Camera, optics
 from kcam.context import Context
-from kcam.optics.rendering.depth import Layers, layer_shares
+from kcam.optics.numerics import bracketed
+from kcam.optics.rendering.depth import Layers, few_values, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.scene import Scene
 from kcam.sensor import ColourFilter
@@ -439,3 +440,29 @@ def test_layers_under_vmap() -> None:
     torch.testing.assert_close(torch.func.vmap(light)(scales), torch.stack([light(one) for one in scales]))
     both = torch.func.vmap(light)(scales, torch.stack([shares, shares]))
     torch.testing.assert_close(both, torch.stack([light(one) for one in scales]))
+
+
+@pytest.mark.parametrize("different", [1, 2, 7, 16, 17, 40])
+def test_few_values_are_all_that_there_are(different: int) -> None:
+    """One that a single pixel of many has, too."""
+    draw = Draw(different)
+    known = torch.linspace(0.3, 4.0, different, dtype=torch.float64)
+    values = known[(draw.noise(1, 1, 120, 130) * different).long().clamp(max=different - 1)]
+    torch.testing.assert_close(few_values(values, at_most=different), values.unique())
+    values[0, 0, 3, 1] = 9.0
+    torch.testing.assert_close(few_values(values, at_most=different + 1), values.unique())
+    assert few_values(values, at_most=different) is None
+
+
+@pytest.mark.parametrize("count", [2, 3, 9])
+def test_values_lie_between_the_nodes_beside_them(count: int) -> None:
+    draw = Draw(count)
+    nodes, at = draw.noise(count).sort().values, 3 * draw.noise(5, 40) - 1
+    before, share = bracketed(nodes, at)
+    assert before.min() >= 0
+    assert before.max() <= count - 2
+    torch.testing.assert_close(nodes[before] + share * (nodes[before + 1] - nodes[before]), at)
+    inside = (at >= nodes[0]) & (at < nodes[-1])
+    assert ((share[inside] >= 0) & (share[inside] < 1)).all()
+    nodes.requires_grad_()
+    assert torch.autograd.gradcheck(lambda own: bracketed(own, at)[1], nodes)

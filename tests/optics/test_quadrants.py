@@ -10,10 +10,12 @@ from torch import nn
 
 from kcam import optics
 from kcam.optics import PROPAGATORS
+from kcam.optics.elements.zernike import zernike_sum
 from kcam.optics.propagation import pixels, sampling
 from kcam.optics.propagation.cells import Cells
 from kcam.optics.propagation.pixels import Pixels, _Parities
 from kcam.optics.propagation.transforms import MatrixTransform
+from kcam.optics.pupil.coordinates import Pupil, from_image_side, grid_nodes
 from kcam.optics.pupil.quadrants import by_x, join, join_adjoint, parities, split, unfold
 from kcam.units import mm, nm, um
 
@@ -49,6 +51,42 @@ def test_an_unfolded_quadrant_is_even(generator: torch.Generator) -> None:
     assert torch.equal(whole, whole.flip(-1))
     assert torch.equal(whole, whole.flip(-2))
     assert torch.equal(whole[:, 4:, 4:], quadrant)
+
+
+@pytest.mark.parametrize("terms", [1, 4, 11, 28])
+@pytest.mark.parametrize("paraxial", [True, False])
+def test_zernikes_of_a_mirrored_pupil_are_those_of_the_whole(
+    terms: int, paraxial: bool, generator: torch.Generator
+) -> None:
+    """Which are found in one quadrant, by what is odd in x and in y."""
+    nodes, one = grid_nodes(12), torch.ones((), dtype=DOUBLE)
+    coefficients = torch.randn(terms, generator=generator, dtype=DOUBLE, requires_grad=True)
+    weights = torch.randn(12, 12, generator=generator, dtype=DOUBLE)
+    found = []
+    for along, mirror in ((nodes, False), (nodes[6:], True)):
+        x, y = from_image_side(along[None, :], along[:, None], one * (not paraxial))
+        pupil = Pupil(x, y, one, one, paraxial)
+        value = zernike_sum(coefficients, pupil.mirrored() if mirror else pupil)
+        whole = join(value if value.ndim == 3 else value.expand(4, -1, -1), odd=False) if mirror else value
+        found.append((whole, torch.autograd.grad((whole * weights).sum(), coefficients)[0]))
+    for part, other in zip(*found, strict=True):
+        torch.testing.assert_close(part, other)
+
+
+def test_an_element_sees_the_pupil_s_points_wherever_they_are(generator: torch.Generator) -> None:
+    """A grid comes as its quadrants: what is odd, even, or the same for all, is found at each point."""
+    nodes, one = grid_nodes(10), torch.ones((), dtype=DOUBLE)
+    whole = Pupil(nodes[None, :], nodes[:, None], one, one, paraxial=False)
+    mirrored = Pupil(nodes[5:][None, :], nodes[5:][:, None], one, one, paraxial=False).mirrored()
+    shape = torch.randn(3, generator=generator, dtype=DOUBLE)
+    for term in (
+        lambda pupil: shape[0] * pupil.x + shape[1] * pupil.y * pupil.rho2,
+        lambda pupil: shape[2] * pupil.x * pupil.y,
+        lambda pupil: pupil.beyond_paraxial(shape[0]),
+    ):
+        found = term(mirrored)
+        quadrants = found if found.ndim == 3 else found.expand(4, -1, -1)
+        torch.testing.assert_close(join(quadrants, odd=False), term(whole).expand(10, 10))
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(5, 5), (7, 3), (1, 5)])
