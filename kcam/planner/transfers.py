@@ -331,8 +331,8 @@ class Transfers:
     def table(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, *, grey: bool = False) -> Table | None:
         """Transfer functions of these wavelengths and others, where optics know them without PSFs.
 
-        Of many layers, and in grey light, a few wavelengths have a table, else all that are usually asked for. One layer
-        of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
+        Of many layers, and in grey light, a few wavelengths have a table, else all that are usually asked for. One
+        layer of several has it beside the ends of the scene: of the same rings, whose kernel takes the time.
         """
         if self.folded_across:
             return None

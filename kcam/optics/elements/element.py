@@ -102,7 +102,7 @@ class Element(nn.Module):
         return torch.zeros_like(wavelengths)
 
     def terms(self, pupil: Pupil, wavelengths: Tensor) -> list[Term]:
-        """The rest of the OPD at the points of a pupil, whatever axes these have: a grid may come as its four quadrants."""
+        """The rest of the OPD at a pupil's points, whatever axes these have: a grid may come as its four quadrants."""
         return []
 
     def pixel_map(self, wavelengths: Tensor) -> PixelMap | None:
