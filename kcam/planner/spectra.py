@@ -264,7 +264,7 @@ class Spectra:
         """
         optics, found = self.optics, (0, 0)
         imaging = optics.stage(settings)
-        wavelengths = imaging.psf_wavelengths(self.wavelengths, deep=optics.deep)
+        wavelengths = imaging.psf_wavelengths(self.wavelengths)
         for index in range(len(self.groups)):
             vergences = self._of(index, settings.get("layers")).vergences
             window = optics.window(imaging, vergences)
