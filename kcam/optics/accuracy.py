@@ -60,8 +60,8 @@ class Accuracy(Recipe):
             their group's mean wavelength, whatever their number.
         interpolate_bands: of fewer, give each band the cubic in 1/wavelength through the PSFs of the four nearest: once
             they resolve the fringes errors fall with the square of their number and more, not the first power. Such
-            PSFs may be below zero, and hide less than nothing, which is cut off, where a channel sees little but the
-            outermost bands: plans keep to bands that share there. Over the field they share all the same.
+            PSFs may be below zero, and what hides something must not: of scenes with a map of depth, and over the
+            field, neighbouring bands share a PSF all the same.
         psf_shape: (H, W) of the PSF's window in pixels; None: see `Imaging.psf_window`.
         renormalise: give a PSF that psf_shape cuts its whole light again.
         layers: number of depth layers over the range of a depth map, at equal steps of 1/z, or their distances [m];

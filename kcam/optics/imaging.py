@@ -32,7 +32,7 @@ from kcam.optics.rendering.place import Place
 from kcam.optics.rendering.renderer import Renderer
 from kcam.optics.rendering.rounding import not_negative, wide_range
 from kcam.optics.source import Defocus, FieldPSFs, PixelGrid, Points, PSFSource, is_field_source, is_source
-from kcam.optics.wavelengths import few_wavelengths, sees_less
+from kcam.optics.wavelengths import few_wavelengths
 from kcam.optics.work import PictureWork
 from kcam.precision import full_precision
 from kcam.scene import Scene
@@ -354,36 +354,28 @@ class Imaging(Stage):
         """PSFs of the bands of a scene at one distance, (Z, L, h, w) in the dtype and on the device of `like`; kept
         while nothing changes. The caller's own: it may be changed in place.
         """
-        nodes, shares = self._few(wavelengths)
+        nodes, shares = self._few(wavelengths, deep=False)
         psfs = self._grouped_bank(nodes, points=Points(vergences), shape=shape, like=like)
         with full_precision(psfs.device):
             return psfs.clone() if shares is None else torch.einsum("lg,zghw->zlhw", shares.to(psfs), psfs)
 
-    def _few(self, wavelengths: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _few(self, wavelengths: Tensor, *, deep: bool) -> tuple[Tensor, Tensor | None]:
         count, accuracy = len(wavelengths), self.accuracy
         if accuracy.blur and (accuracy.bands is None or accuracy.bands >= count):
             return wavelengths, None
         few, between = (accuracy.bands or count) if accuracy.blur else 1, accuracy.interpolate_bands
-        return few_wavelengths(wavelengths, few, interpolate=between and not self.varies)
+        return few_wavelengths(wavelengths, few, interpolate=between and not (deep or self.varies))
 
-    def psf_wavelengths(self, wavelengths: Tensor) -> Tensor:
-        """At which the PSFs are computed, (G,) [m]: the bands', or fewer."""
-        return self._few(wavelengths)[0]
+    def psf_wavelengths(self, wavelengths: Tensor, *, deep: bool = False) -> Tensor:
+        """At which the PSFs are computed, (G,) [m]: the bands', or fewer; deep: of a scene with a map of depth."""
+        return self._few(wavelengths, deep=deep)[0]
 
-    def shares(self, wavelengths: Tensor) -> Tensor | None:
+    def shares(self, wavelengths: Tensor, *, deep: bool = False) -> Tensor | None:
         """What each of these PSFs gives to each band, (L, G); None where each band has its own."""
-        return self._few(wavelengths)[1]
+        return self._few(wavelengths, deep=deep)[1]
 
-    def _colours(self, scene: Scene, weights: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """The same of a picture: where depth has a map, bands share PSFs of which a channel would see less than
-        nothing. weights: of channels (C, L); None for bands.
-        """
-        nodes, shares = self._few(scene.wavelengths)
-        if shares is None or not self.accuracy.interpolate_bands or (weights is not None and weights.is_meta):
-            return nodes, shares
-        if self.accuracy.occlusion and is_deep(scene) and sees_less(weights, shares):
-            return few_wavelengths(scene.wavelengths, len(nodes), interpolate=False)
-        return nodes, shares
+    def _colours(self, scene: Scene) -> tuple[Tensor, Tensor | None]:
+        return self._few(scene.wavelengths, deep=is_deep(scene))
 
     def _grouped_bank(self, nodes: Tensor, *, points: Points, shape: tuple[int, int], like: Tensor) -> Tensor:
         """PSFs at wavelengths (G,), from which the bands take theirs, (Z, G, h, w)."""
@@ -510,8 +502,7 @@ class Imaging(Stage):
             return self._finished(light, weights, afterwards)
         window = self.psf_window(scene.wavelengths, vergences=vergences, picture=(height, width))
         renderer = self._renderer(scene, window, weights=weights, like=planes)
-        light, length = planes.new_zeros(()), renderer.at_once
-        nodes, _ = self._colours(scene, weights)
+        light, nodes, length = planes.new_zeros(()), self._colours(scene)[0], renderer.at_once
         for position, own in zones(planes, self._positions, pixel_pitch=self.pixel_pitch):
             layers = Layers(own, shares, occlusion=self.accuracy.occlusion)
             for start in range(0, len(vergences), length):
@@ -528,7 +519,7 @@ class Imaging(Stage):
 
     def _renderer(self, scene: Scene, window: tuple[int, int], *, weights: Tensor | None, like: Tensor) -> Renderer:
         """How a picture is convolved, with PSFs of which there are the sizes alone."""
-        nodes, shares = self._colours(scene, weights)
+        nodes, shares = self._colours(scene)
         psfs, spectra = like.new_empty(1).expand(1, len(nodes), *window), scene.spectra
         own = {name: getattr(self.accuracy, name) for name in ("direct", "tile", "max_memory")}
         own |= {"border": self.border, "picture": scene.shape[1:], "shares": shares, "cache": self._transfer_cache}

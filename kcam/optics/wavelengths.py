@@ -10,8 +10,6 @@ from torch import Tensor
 
 from kcam.optics.numerics import chebyshev_between, cubic_weights, lagrange_weights
 
-_LESS = 0.1  # of all that a channel sees: a lit edge behind two PSFs, of one of which red saw -0.14, was 7 times as far
-# off as by bands that share; from -0.09 on nearly all of 150 deep scenes were nearer
 _NEAR = 0.25  # of a step, all that bands may lie beside its middle to be taken for it: of more cubics err more
 
 
@@ -24,14 +22,6 @@ def few_wavelengths(wavelengths: Tensor, count: int, *, interpolate: bool) -> tu
     """
     nodes, shares = _few(tuple(wavelengths.tolist()), count, interpolate)
     return nodes.to(wavelengths, copy=True), shares.clone()
-
-
-def sees_less(channels: Tensor | None, shares: Tensor) -> bool:
-    """Whether a channel, of weights (C, L), or else a band, sees much less than nothing of a PSF that gives bands so
-    much, (L, G): what is cut off by it would hide less than nothing.
-    """
-    seen = shares.double() if channels is None else channels.detach().to(shares) @ shares
-    return bool((seen.amin(1) < -_LESS * seen.sum(1).abs()).any())
 
 
 def chebyshev_wavelengths(wavelengths: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,7 @@ from kcam.camera import DEVELOPING, Camera
 from kcam.context import Context
 from kcam.effects import relative_rms
 from kcam.optics import Imaging
+from kcam.optics.imaging import is_deep
 from kcam.plain import from_json
 from kcam.planner.range import Range
 from kcam.planner.survey import survey
@@ -157,6 +158,8 @@ class Plan:
         is outside.
         """
         geometry, window = self.range.leaves(scene), self.changes.get("psf_shape", (1, 1))
+        if self.changes.get("interpolate_bands") and is_deep(scene):
+            geometry = "has a map of depth, through which bands share PSFs; the plan was for scenes at one distance"
         for own, planned, side in zip(scene.shape[1:], (self.range.height, self.range.width), window, strict=True):
             if side < max(window) and own > planned:  # the window was only as large as the picture
                 geometry = f"is {own} pixels across where the plan was for {planned}, of which it needs more"

@@ -264,7 +264,7 @@ class Spectra:
         """
         optics, found = self.optics, (0, 0)
         imaging = optics.stage(settings)
-        wavelengths = imaging.psf_wavelengths(self.wavelengths)
+        wavelengths = imaging.psf_wavelengths(self.wavelengths, deep=optics.deep)
         for index in range(len(self.groups)):
             vergences = self._of(index, settings.get("layers")).vergences
             window = optics.window(imaging, vergences)

@@ -23,7 +23,7 @@ from kcam.optics.propagation.question import Query
 from kcam.optics.propagation.row import Propagator, Transfer
 from kcam.optics.propagation.sampling import along_axis
 from kcam.optics.source import Defocus, Points
-from kcam.planner.band_counts import FEW_BANDS, ROUND, interpolated, node_counts
+from kcam.planner.band_counts import FEW_BANDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.cross_spectra import rings
 from kcam.scene import Scene
 
@@ -127,11 +127,11 @@ class Transfers:
     @functools.cached_property
     def _every(self) -> Tensor:
         """All wavelengths at which PSFs may stand for those of others."""
-        own = self.wavelengths
-        some = [interpolated(count) for count in node_counts(len(own))]
-        every: list[dict[str, Any]] = [{"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, *some]
-        stages = [*map(self.stage, every), self.imaging]
-        return torch.cat([stage.psf_wavelengths(own) for stage in stages]).unique()
+        own, deep = self.wavelengths, self.deep
+        counts = (group_counts if deep else node_counts)(len(own))
+        some = [{"bands": n} if deep else interpolated(n) for n in counts]
+        stages = [*map(self.stage, ({"bands": None}, {"bands": 1}, {"bands": FEW_BANDS}, *some)), self.imaging]
+        return torch.cat([stage.psf_wavelengths(own, deep=deep) for stage in stages]).unique()
 
     def _every_and(self, wavelengths: Tensor) -> Tensor:
         """These, and those of `_every`: mostly they are among them."""
@@ -143,14 +143,13 @@ class Transfers:
     @functools.cached_property
     def _usual(self) -> Tensor:
         """All bands, between which others lie, and the few that are asked for beside them."""
-        few = [self.stage({"bands": count}).psf_wavelengths(self.wavelengths) for count in _ASKED]
+        few = [self.stage({"bands": count}).psf_wavelengths(self.wavelengths, deep=self.deep) for count in _ASKED]
         return torch.cat([self.wavelengths, *few]).unique()
 
     @functools.cached_property
     def _nodes(self) -> Tensor:
         """Of all bands, those between whose line spreads those of others lie."""
-        own = self.wavelengths
-        return own if len(own) <= _FEW_LINES else _ends_and_between(own, _FEW_LINES)
+        return _ends_and_between(self.wavelengths, _FEW_LINES)
 
     def between(self, psfs: int | None, *, lines: bool) -> tuple[Way, float]:
         """How line spreads, or else tables of all bands, tell what so many PSFs for all wavelengths cost, and times the
@@ -173,8 +172,8 @@ class Transfers:
         """Slices along x and y, or both diagonals, at G wavelengths, (Z, G, 2, F), and what each gives to each band of
         light of wavelengths (L,), (L, G).
         """
-        groups = imaging.psf_wavelengths(wavelengths)
-        shares = imaging.shares(wavelengths)
+        groups = imaging.psf_wavelengths(wavelengths, deep=self.deep)
+        shares = imaging.shares(wavelengths, deep=self.deep)
         nodes = wavelengths
         if way is Way.BETWEEN_FEW or (way is Way.BESIDE_FEW and shares is None):
             nodes = self._nodes

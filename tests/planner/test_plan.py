@@ -644,8 +644,8 @@ def test_a_plan_for_a_saturated_scene_holds_in_the_dark() -> None:
     assert dark <= 0.01 or plan.outside(shot, scene())
 
 
-def test_psfs_between_wavelengths_are_for_maps_of_depth_too() -> None:
-    """A plan for scenes at two distances holds for one that lies between them."""
+def test_psfs_between_wavelengths_are_for_scenes_at_one_distance() -> None:
+    """With a map of depth bands share PSFs, and a plan says that it does not know what that costs."""
     near, far = (scene(depth=depth) for depth in (1.2, 2.0))
     shot = camera(diameter=4 * mm)
     with torch.no_grad():
@@ -655,8 +655,7 @@ def test_psfs_between_wavelengths_are_for_maps_of_depth_too() -> None:
             assert plan.outside(shot, flat) is None
             assert plan.measure(shot, flat) <= 0.01
         deep = scene(depth=ramp(1.2, 2.0))
-        assert plan.outside(shot, deep) is None
-        assert plan.measure(shot, deep) <= 0.01
+        assert "has a map of depth" in (plan.outside(shot, deep) or "")
 
 
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in range(2, 12))])
