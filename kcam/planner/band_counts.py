@@ -39,11 +39,11 @@ def group_counts(total: int) -> list[int]:
 
 
 def node_counts(total: int) -> list[int]:
-    """Numbers of wavelengths between whose PSFs all others lie, ascending, each about half as many again as the one
-    before; up to 0.7 of all, beyond which next to nothing is saved.
+    """Numbers of wavelengths between whose PSFs all others lie, ascending, each about four thirds of the one before; up
+    to 0.7 of all, beyond which next to nothing is saved.
     """
     found = [1]
-    while (more := max(found[-1] + 1, found[-1] * 3 // 2)) <= 0.7 * total:
+    while (more := max(found[-1] + 1, found[-1] * 4 // 3)) <= 0.7 * total:
         found.append(more)
     return found if total > 1 else []
 

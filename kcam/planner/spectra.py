@@ -142,7 +142,7 @@ class Spectra:
             return False
         if bool(cut.any()):
             every = {**settings, "bands": None}
-            way = Way.BETWEEN_FEW if self.by_lines(every) else Way.LINES
+            way, _ = self.optics.between(1, lines=self.by_lines(every)) if self.tabled(every) else (Way.LINES, 1.0)
             said = torch.where(cut, self._whole(every, way), said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
         return True
