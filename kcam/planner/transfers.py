@@ -164,7 +164,8 @@ class Transfers:
         nodes, bands = (len(own) if _steps(own) < _WIDEST_STEP else 0 for own in (self._nodes, self.wavelengths))
         nodes = nodes if lines else 0
         few, every = (
-            next((factor for each, factor in _BETWEEN.items() if each * psfs <= known), None) for known in (nodes, bands)
+            next((factor for each, factor in _BETWEEN.items() if each * psfs <= known), None)
+            for known in (nodes, bands)
         )
         if few is not None:
             return Way.BETWEEN_FEW, few
