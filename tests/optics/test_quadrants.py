@@ -83,6 +83,8 @@ def test_an_element_sees_the_pupil_s_points_wherever_they_are(generator: torch.G
         lambda pupil: shape[0] * pupil.x + shape[1] * pupil.y * pupil.rho2,
         lambda pupil: shape[2] * pupil.x * pupil.y,
         lambda pupil: pupil.beyond_paraxial(shape[0]),
+        lambda pupil: pupil.x.expand_as(pupil.rho2),
+        lambda pupil: torch.where(pupil.y > 0.2, pupil.rho2, pupil.measure),
     ):
         found = term(mirrored)
         quadrants = found if found.ndim == 3 else found.expand(4, -1, -1)

@@ -117,6 +117,11 @@ class Element(nn.Module):
         return arguments_text(self)
 
 
+def is_even(element: Element) -> bool:
+    """Whether its path tells neither x from -x nor y from -y, by its type."""
+    return element.even and "terms" not in vars(element)
+
+
 def set_tensor(module: nn.Module, name: str, value: Tensor) -> None:
     """Register a Parameter as such and any other tensor as a buffer."""
     if isinstance(value, nn.Parameter):

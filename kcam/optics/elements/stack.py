@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from kcam.cache import ValueCache, seen
 from kcam.optics.elements.apertures import Aperture, rim_per_area
 from kcam.optics.elements.diffractive import DOE
-from kcam.optics.elements.element import Element, check_numbers, place_sensor
+from kcam.optics.elements.element import Element, check_numbers, is_even, place_sensor
 from kcam.optics.elements.refractive import PlanoConvexLens
 from kcam.optics.numerics import Scalar, float64
 from kcam.optics.pupil.maps import PixelMap, pixel_under
@@ -91,7 +91,7 @@ class ElementStack(nn.Module):
     @property
     def even(self) -> bool:
         """Whether no element's path tells x from -x and y from -y, by its type; maps of pixels may."""
-        return all(element.even and "terms" not in vars(element) for element in self.elements)
+        return all(map(is_even, self.elements))
 
     @property
     def round(self) -> bool:

@@ -57,8 +57,8 @@ def zernike_sum(coefficients: Tensor, pupil: Pupil) -> Tensor:
     polynomial, so value and gradient are finite on the axis. Cosines are even in y, and in x where m is; sines are odd
     in y, and in x where m is even: of a mirrored pupil one quadrant does.
     """
-    part, rho2 = pupil.quadrant or pupil, pupil.rho2
-    x, y = torch.broadcast_tensors(part.x, part.y)
+    part = pupil.quadrant or pupil
+    rho2, (x, y) = part.rho2, torch.broadcast_tensors(part.x, part.y)
     powers = torch.ones_like(rho2), torch.zeros_like(rho2)
     total = {(False, False): torch.zeros_like(rho2)}  # by whether it is odd in x, and in y
     every = float64(coefficients).to(rho2.device).unbind()

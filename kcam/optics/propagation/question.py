@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from kcam.cache import ValueCache, differentiated, seen
-from kcam.optics.elements.element import Element
+from kcam.optics.elements.element import Element, is_even
 from kcam.optics.elements.stack import ElementStack
 from kcam.optics.propagation import sampling
 from kcam.optics.propagation.pixels import Pixels
@@ -286,22 +286,24 @@ def residual_path(query: Query, pupil: Pupil, elements: Sequence[Element] | None
     """The residual OPD as (coefficients (L, Z, T), maps (T, ...)), W = coefficients . maps, both float64.
 
     The first map is rho^2 with V a^2 / 2; then what the image-side and the object-side sphere have beyond their
-    parabolas, then the terms of the elements, or of those that are given. Pixel maps are not part of it.
+    parabolas, then the terms of the elements, or of those that are given. Pixel maps are not part of it. Of a mirrored
+    pupil, what is even is found in one quadrant.
     """
+    first = pupil.quadrant or pupil
     wavelengths = query.wavelengths.to(query.device)
     bands, distances = wavelengths.numel(), query.vergences.numel()
     ones = wavelengths.new_ones(bands, distances)
     coefficients = [residual_vergence(query) * query.semi_aperture**2 / 2]
-    maps = [pupil.rho2]
+    maps = [first.rho2]
     if not query.paraxial:
         coefficients.append(ones)
-        maps.append(pupil.beyond_paraxial(1 / query.sensor_distance))
+        maps.append(first.beyond_paraxial(1 / query.sensor_distance))
         every = torch.arange(distances, device=query.device)
         near = every if differentiated(query.vergences) else every[query.vergences != 0]
         coefficients += (ones * (every == near[:, None, None])).unbind(0)
-        maps += pupil.beyond_paraxial(query.vergences[near][(..., *[None] * pupil.rho2.ndim)]).unbind(0)
+        maps += first.beyond_paraxial(query.vergences[near][(..., *[None] * first.rho2.ndim)]).unbind(0)
     for element in query.lens.elements if elements is None else elements:
-        for coefficient, term in element.terms(pupil, wavelengths):
+        for coefficient, term in element.terms(first if is_even(element) else pupil, wavelengths):
             coefficients.append(coefficient[:, None] * ones)
             maps.append(term)
     return torch.stack(coefficients, dim=-1), _stacked(maps)

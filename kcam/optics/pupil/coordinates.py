@@ -32,7 +32,7 @@ class Pupil:
     sensor_distance:  d [m], likewise.
     paraxial:         True where the Fresnel approximation holds by definition of the model.
     round:            True where no light passes beyond rho = 1.
-    quadrant:         of points that are mirrored, the first of the four; the others have the same radii.
+    quadrant:         of points that are mirrored, the first of the four: what is even is the same in the others.
     """
 
     x: Tensor
@@ -44,9 +44,7 @@ class Pupil:
     quadrant: Pupil | None = None
 
     def mirrored(self) -> Pupil:
-        """That of points of one quadrant in all four, x and y (4, ...) in the order of `quadrants`: what depends on the
-        radius alone is that of one.
-        """
+        """That of points of one quadrant in all four, x and y (4, ...) in the order of `quadrants`."""
         across, down = signs(self.x)
         return replace(self, x=across * self.x, y=down * self.y, quadrant=self)
 
@@ -54,7 +52,7 @@ class Pupil:
     def rho2(self) -> Tensor:
         """Squared normalised radius; kept squared, because sqrt has no gradient at 0."""
         if self.quadrant is not None:
-            return self.quadrant.rho2
+            return self.quadrant.rho2.expand(torch.broadcast_shapes(self.x.shape, self.y.shape))
         return self.x.square() + self.y.square()
 
     @property
