@@ -142,8 +142,7 @@ class Spectra:
             return False
         if bool(cut.any()):
             every = {**settings, "bands": None}
-            way, _ = self.optics.between(1, lines=self.by_lines(every)) if self.tabled(every) else (Way.LINES, 1.0)
-            said = torch.where(cut, self._whole(every, way), said)
+            said = torch.where(cut, self._whole(every, self._way_of_colours(1, every)[0]), said)
         self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
         return True
 
@@ -361,6 +360,12 @@ class Spectra:
                 found[0, rows] *= replaced[rows] ** 2
         return found[0] * factor**2 * self._alone, found[1]
 
+    def _way_of_colours(self, psfs: int | None, against: Mapping[str, Any]) -> tuple[Way, float]:
+        """As `_way`, of so many PSFs for all wavelengths."""
+        if not self.tabled(against):
+            return Way.LINES, 1.0
+        return self.optics.between(psfs, lines=self.by_lines(against))
+
     def _way(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> tuple[Way, float]:
         """How transfer functions are found that tell of changes, and times the error that they tell."""
         by_psfs = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
@@ -368,8 +373,8 @@ class Spectra:
             return Way.PSFS, 1.0
         if care is Care.AT_FIRST:
             return Way.WHOLE_LINES, 1.0
-        if _differ(changes, against, COLOURS) and self.tabled(against):
-            return self.optics.between(changes.get("bands"), lines=self.by_lines(against))
+        if _differ(changes, against, COLOURS):
+            return self._way_of_colours(changes.get("bands"), against)
         return Way.LINES, 1.0
 
     @functools.cached_property

@@ -147,7 +147,7 @@ class Transfers:
         """All bands, between which others lie if they are dense, and the few that are asked for beside them."""
         own = self.wavelengths
         few = [self.stage({"bands": count}).psf_wavelengths(own, deep=self.deep) for count in _ASKED]
-        return torch.cat([own if _steps(own) < _WIDEST_STEP else self._every, *few]).unique()
+        return torch.cat([own if self._dense[1] else self._every, *few]).unique()
 
     @functools.cached_property
     def _nodes(self) -> Tensor:
@@ -155,14 +155,19 @@ class Transfers:
         own = self.wavelengths
         return own if len(own) <= _FEW_LINES else _ends_and_between(own, _FEW_LINES)
 
+    @functools.cached_property
+    def _dense(self) -> tuple[int, int]:
+        """How many nodes, and bands, there are; 0 where they lie too far apart for others to lie between them."""
+        nodes, bands = (len(own) if _steps(own) < _WIDEST_STEP else 0 for own in (self._nodes, self.wavelengths))
+        return nodes, bands
+
     def between(self, psfs: int | None, *, lines: bool) -> tuple[Way, float]:
         """How line spreads, or else tables of all bands, tell what so many PSFs for all wavelengths cost, and times the
         error that they tell.
         """
         if psfs is None or len(self.wavelengths) <= _FEW_LINES:
             return Way.LINES, 1.0
-        nodes, bands = (len(own) if _steps(own) < _WIDEST_STEP else 0 for own in (self._nodes, self.wavelengths))
-        nodes = nodes if lines else 0
+        nodes, bands = self._dense if lines else (0, self._dense[1])
         few, every = (
             next((factor for each, factor in _BETWEEN.items() if each * psfs <= known), None)
             for known in (nodes, bands)
