@@ -80,6 +80,7 @@ class Evaluator:
         self._looked: Mapping[str, Any] = {}
         self.dimmed: list[float] = []  # of each signal, by blur, where it was looked at without: RMS over RMS
         self.spectra: list[Spectra] | None = None
+        self._hiding: dict[Any, float] = {}
         self._laid_out: dict[tuple[Any, ...], tuple[Tensor, Tensor, list[Place]]] = {}
 
     def laid_out(self, imaging: Imaging, scene: Scene) -> tuple[Tensor, Tensor, list[Place]]:
@@ -103,6 +104,11 @@ class Evaluator:
         if self.whole:
             return self.witnesses
         return samples_of(self.scenes, self.surveys, pixels=WITNESSED if self.varies else LARGEST, side=CROP)
+
+    def samples_have(self, distances: Tensor) -> bool:
+        """Whether there is something at each of so many distances in what choices are tried on."""
+        found = torch.cat([torch.as_tensor(sample.scene.depth).flatten() for sample in self.samples])
+        return bool(torch.isin(distances, found).all())
 
     @functools.cached_property
     def witnesses(self) -> list[Sample]:
@@ -237,7 +243,7 @@ class Evaluator:
             unseen = self._dispersion * self._left_out_by_rank(rank) if rank is not None else 0.0
             return self._dimming * max(self.lost.values(), default=1.0) * math.hypot(tried, unseen)
         if changes.get("occlusion") != against.get("occlusion"):
-            return self._hidden(changes, against)
+            return self.hiding(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self.spectra, strict=True):
             found += self._relative(sample, torch.stack(spectra.energies(changes, against, care)))
@@ -301,9 +307,13 @@ class Evaluator:
                     found[owner] = max(found[owner], 1.0)
         return found
 
-    def _hidden(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
-        """The error of what does not hide what it should, of the scenes with most light that may be hidden; at most
-        that light where there is hardly any.
+    def behind_edges(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
+        """Of light that goes on behind what is nearer, how much more that is: see `Spectra`."""
+        return max((one.behind_edges(changes, against) for one in self.spectra or () if one.optics.deep), default=0.0)
+
+    def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
+        """The error of what does not hide what it should, or otherwise, tried out on the scenes with most light that
+        may be hidden; at most that light where there is hardly any.
         """
         hidden = self.hidden
         found, tried, pixels = [min(light, HARDLY) for light in hidden], set(), 0

@@ -24,9 +24,6 @@ foretold, not seen.
 COLOURFUL = 2.0
 """How many times as much windows may cost at a few wavelengths as at one that tells of them."""
 
-FINE = 7e-3
-"""Error below which seams between layers count: above, what planes between others miss is more."""
-
 LITTLE = 1 / 2
 """Of the error that there may be, that a rough estimate may be at its largest and be taken."""
 
@@ -60,8 +57,8 @@ class Ladder:
     with which power of its step its error falls at most, so that rungs which cannot do are not looked at; None where
     any may do. marks: fineness of the rungs by which others are priced, of successive ones: few, so that these are
     computed once.
-    seams: what a rung errs beside that, of layers that hide each other: asked for where so little counts (`FINE`),
-    by `most`, what was allowed when it was last priced.
+    seams: what a rung errs in all, of layers that hide each other, by what it errs without and what was allowed when it
+    was last priced (`most`): asked for where it may do without.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     confirmed_beside: other settings, beside which a rung that may do is priced again.
     bounds: errors that rungs have at most, by their position: where so much is `small` (`SMALL`), it needs no pricing.
@@ -88,7 +85,7 @@ class Ladder:
     from_top: bool = False
     fastest: float | None = None
     marks: tuple[int, ...] = ()
-    seams: Callable[[Level], float] | None = None
+    seams: Callable[[Level, float, float], float] | None = None
     least: float = 0.0
     confirmed_beside: dict[str, Any] | None = None
     bounds: dict[int, float] = field(default_factory=dict)
@@ -134,7 +131,9 @@ class Ladder:
             error = self.off_by * self.roughly[self.rough][key]
         else:
             error = self.at_least[position]
-        return math.hypot(error, self.seams(self.levels[position])) if self.seams and self.most < FINE else error
+        if self.seams is not None and error <= self.most:
+            error = self.seams(self.levels[position], error, self.most)
+        return math.inf if math.isnan(error) else error
 
     def _key(self, position: int) -> tuple[int, int]:
         return position, self._followed
@@ -322,4 +321,5 @@ class Ladder:
         below = max((key for key in known if key[0] < self.position), default=None)
         if below is None:
             return "would save less time than it takes to find out"
-        return f"{self.levels[below[0]].label} would cost {known[below]:.2g}"
+        cost = known[below] if self.seams is None else max(known[below], self._error(below[0]))
+        return f"{self.levels[below[0]].label} would cost {cost:.2g}"

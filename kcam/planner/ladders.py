@@ -5,7 +5,6 @@ To add a choice, write a function that gives its ladder, and a row of `LADDERS`.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -21,18 +20,26 @@ from kcam.optics.rendering.depth import few_values
 from kcam.optics.source import Points
 from kcam.planner.band_counts import FEW_BANDS, GRIDS, ROUND, group_counts, interpolated, node_counts
 from kcam.planner.evaluation import CROP, HARDLY, Evaluator
-from kcam.planner.ladder import Ladder, Level
+from kcam.planner.ladder import LITTLE, Ladder, Level
 from kcam.planner.spectra import Care
 from kcam.planner.survey import RANKS
 from kcam.planner.transfers import GAPS, PARAXIAL
 from kcam.scene import Scene
 
-FEW_LAYERS, FEWER_LAYERS, MORE_LAYERS, TAIL = 3, 2, 5, 16
+FEW_LAYERS, FEWER_LAYERS, TAIL = 3, 2, 16
 """Of the settings beside which a choice is priced: layers, those of one scene behind maps of pixels (an item of a batch
-may lie anywhere between: it was told 0.65 of what it errs), and those of wavelengths where few lights stand out before
-round optics, of which one may be in focus between three layers; and pixels of the PSF beyond its rays.
+may lie anywhere between: it was told 0.65 of what it errs), and pixels of the PSF beyond its rays.
 Behind maps wavelengths of 73 deep scenes cost 0.78 to 1 times what they cost with all layers (5 to 95 %), and with 3
-layers 0.83 to 1 times; those of a lamp through a round lens were told 0.43 of what they cost with 3.
+layers 0.83 to 1 times.
+"""
+
+BRIGHTEST = 4
+"""Pixels whose distances count where a few lights stand out."""
+
+SPREAD = 8.0
+"""By how many pixels blur differs from one end of a scene to the other, from which on, and where few lights stand out
+before round optics, wavelengths are priced beside the layers `around_focus`: beside three in even steps lenses were
+told 0.3 to 0.9 of what they cost with all layers, beside these 0.75 to 1.08 times (of 8; one of glass 0.5).
 """
 
 BLUR_APART = 1 / 2
@@ -56,9 +63,9 @@ ONE_PLANE = 2e-3
 differs from that in the middle: 1.8e-3 to 0.8 of 202 scenes, less of 4 whose ends hardly differ.
 """
 
-HIDING, HIDING_LIGHTS, BY_FEWER = 4, 9, 1.2
+HIDING, HIDING_LIGHTS, BY_FEWER = 4, 17, 1.2
 """Layers of depth with which what hides what costs what it does with more: 0.8 to 1.16 times of 107 scenes, times what
-makes up for that; and of a few lights: 0.93 to 1.07 times.
+makes up for that; and of a few lights: 0.93 to 1.07 times, where 9 told 0.57 of a lamp on a ramp.
 """
 
 BY_LINES, BY_ONE = 4.0, 4.0
@@ -72,6 +79,11 @@ BY_LINES_OF_PIXELS, BY_ONE_MODEL = 1.2, 1.25
 model, at one wavelength. Of 79 windows behind 60 maps they were 0.88 to 5.2 times the truth, of models of 104 maps
 0.64 to 6 times, and to 13 of a few lights.
 """
+
+HIDES_NOTHING = {"occlusion": False}
+
+FINE = 7e-3
+"""Error below which seams between layers count: above, what planes between others miss is more."""
 
 TAKES, TAKES_RANK = 1.2e-2, (2e-2, 3e-8)
 """Seconds, on the machine of the rates, for what line spreads tell of models; and for the ranks of a cube, and each of
@@ -223,14 +235,35 @@ class _View:
         """What the darkest corner has of the light on the axis."""
         return f"down to {self.imaging.illuminated(self.scene):.0%}"
 
-    def few(self, *, bands: int = FEW_BANDS, layers: int | None = None, window: bool = True) -> dict[str, Any]:
+    @property
+    def around_focus(self) -> tuple[float, ...]:
+        """Distances of layers that tell what wavelengths cost: the ends, what is in focus, and halfway to these, or
+        where the brightest of a few lights are.
+        """
+        far, near = (float(end) for end in self.vergences.aminmax())
+        focus = sum(self.evaluator.defocus.focus) / 2
+        middle = focus if far < focus < near else (far + near) / 2
+        places = {far, middle, near}
+        if self.evaluator.few_lights:
+            energy = self.scene.coefficients.detach().square().sum(1).flatten().cpu()
+            vergence = 1 / torch.as_tensor(self.scene.depth, dtype=torch.float64).detach().cpu()
+            lights = vergence.flatten()[energy.topk(min(BRIGHTEST, len(energy))).indices]
+            places |= set(lights.tolist())
+        else:
+            places |= {(far + middle) / 2, (middle + near) / 2}
+        return tuple(1 / place if place > 0 else math.inf for place in sorted(places))
+
+    def few(
+        self, *, bands: int = FEW_BANDS, layers: int | tuple[float, ...] | None = None, window: bool = True
+    ) -> dict[str, Any]:
         """Cheap settings of the others; bands, layers: 0 for all, layers: None for a few."""
         few = dict(self.stand_in)
         if 0 < bands < self.bands and self.computed:
             few["bands"] = bands
         layers = self.few_layers if layers is None else layers
-        if layers and (layers := max(layers, self.least_layers)) < self.layers:
-            few["layers"] = layers
+        count = layers if isinstance(layers, int) else len(layers)
+        if count and max(count, self.least_layers) < self.layers:
+            few["layers"] = layers if count >= self.least_layers else self.least_layers
         core = 2 * (math.ceil(self.blur / self.imaging.pixel_pitch) + TAIL) + 1
         core = min((side for side in WINDOWS if side >= core), default=core)
         if window and core < 0.75 * max(self.window):
@@ -300,7 +333,9 @@ def _precision(view: _View) -> Iterator[Ladder]:
 def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
     lamps = view.query is not None and view.query.symmetric and view.evaluator.few_lights
-    beside = view.few(bands=0, layers=MORE_LAYERS if lamps else None)
+    pixels = view.query is not None and view.query.has_pixel_phase
+    spread = view.layers > FEW_LAYERS and (lamps or (view.defocused > SPREAD and not pixels))
+    beside = view.few(bands=0, layers=view.around_focus if spread else None)
     query, tabled = view.query, view.evaluator.tabled(beside)
     folded = query is not None and (query.folded() or (query.folded(GAPS) and not tabled))
     unsteady = folded or view.evaluator.missed
@@ -312,6 +347,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]
     else:
         few = [interpolated(n) for n in node_counts(view.bands)]
+    seams = _behind_edges(view) if deep and view.evaluator.certain and view.imaging.accuracy.occlusion else None
     shallow = view.layers <= FEW_LAYERS
     if view.one and successive and shallow and not view.stand_in:  # half of the PSFs would save what that takes
         few = [changes for changes in few if 3 * changes["bands"] <= view.bands]
@@ -323,7 +359,23 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         successive=successive,
         orders=QUADRATURE,
         fastest=FASTEST if successive else FASTEST_COLOURS if deep else None,
+        seams=seams,
     )
+
+
+def _behind_edges(view: _View) -> Callable[[Level, float, float], float]:
+    """What fewer wavelengths err behind edges of depth, in light that is not white: so much of what hiding nothing
+    costs, 1.1 to 1.5 times the truth of lines of light, and next to nothing in others.
+    """
+    evaluator, most_hidden = view.evaluator, max(view.evaluator.hidden, default=0.0)
+
+    def seams(level: Level, error: float, most: float) -> float:
+        off = evaluator.behind_edges(level.changes, {})
+        if off * most_hidden < LITTLE * most:
+            return error
+        return math.hypot(error, off * _hidden(view, HIDES_NOTHING, view.few(layers=0)))
+
+    return seams
 
 
 def _rank(view: _View) -> Iterator[Ladder]:
@@ -343,12 +395,15 @@ def _depth(view: _View) -> Iterator[Ladder]:
     if view.layers == 1:
         return
     names = {1: "one plane"}
+    distances = few_values(torch.as_tensor(view.scene.depth), at_most=FEW_DISTANCES)
+    own = distances is not None and len(distances) == view.layers  # which other layers miss
     few = [n for n in LAYERS if n <= MOST * view.layers]
+    if distances is not None and own and not view.evaluator.samples_have(distances):
+        few = []  # nothing tells of what lies there
     levels = [Level(names.get(n, f"{n} layers"), {"layers": n}, n) for n in few]
     top = Level(f"{view.layers} layers", {}, view.layers)
     beside = view.few(layers=0)
-    own = few_values(torch.as_tensor(view.scene.depth), at_most=FEW_DISTANCES)
-    if own is not None and len(own) == view.layers:  # of its own, which other layers miss
+    if own:
         layers = Ladder("depth", [*levels, top], beside)
         if view.evaluator.certain:
             layers.at_least = {0: ONE_PLANE * view.defocused / 2}
@@ -356,10 +411,10 @@ def _depth(view: _View) -> Iterator[Ladder]:
         marks = MARKS if view.evaluator.certain else ()
         layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
     if view.evaluator.certain and view.imaging.accuracy.occlusion:
-        layers.seams = _seams(view, beside)
+        layers.seams = _seams(view, beside, own=own)
     yield layers
     if view.imaging.accuracy.occlusion:
-        levels = [Level("none", {"occlusion": False}), Level("over", {})]
+        levels = [Level("none", HIDES_NOTHING), Level("over", {})]
         tried = any(light >= HARDLY for light in view.evaluator.hidden)
         if view.one and tried:
             levels = levels[1:]  # what would be saved is less than what it takes to find out
@@ -377,18 +432,29 @@ def _hiding(view: _View) -> tuple[int, float]:
     return max(layers, view.least_layers), factor
 
 
-def _seams(view: _View, beside: dict[str, Any]) -> Callable[[Level], float]:
+def _seams(view: _View, beside: dict[str, Any], *, own: bool) -> Callable[[Level, float, float], float]:
     """What layers hide otherwise than more of them do: of 11 scenes 0.2 to 1.4 times what hiding nothing costs, times
     1/n less 1/n of all of them. What planes between others miss falls faster.
+
+    own: whether all layers are at distances of the scene. Then, and of one plane, which hides nothing, that may be most
+    of the error, of lights whose own distance is among those of few layers, and is tried out.
     """
 
-    @functools.cache
-    def hiding() -> float:
-        layers, factor = _hiding(view)
-        few = beside | ({"layers": layers} if view.layers > layers else {})
-        return factor * view.evaluator.error(few | {"occlusion": False}, few)
+    def seams(level: Level, error: float, most: float) -> float:
+        if own or level.fineness == 1:
+            return max(error, _hidden(view, level.changes, beside, own=own))
+        if most >= FINE:
+            return error
+        return math.hypot(error, _hidden(view, HIDES_NOTHING, beside) * max(0.0, 1 / level.fineness - 1 / view.layers))
 
-    return lambda level: hiding() * max(0.0, 1 / level.fineness - 1 / view.layers) if level.fineness > 1 else 0.0
+    return seams
+
+
+def _hidden(view: _View, changes: dict[str, Any], beside: dict[str, Any], *, own: bool = False) -> float:
+    """What hides what otherwise costs, beside a few layers, or, own, all of them."""
+    layers, factor = _hiding(view)
+    few = beside | ({"layers": layers} if view.layers > layers and not own else {})
+    return factor * view.evaluator.hiding(few | changes, few)
 
 
 def _support(view: _View) -> Iterator[Ladder]:

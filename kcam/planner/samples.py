@@ -147,22 +147,26 @@ def _crops(
         found = surveys[row]
         ends = [1e9 - found.far, found.near] if float(found.near.max()) > float(found.far.min()) else []
         kinds = [*found.potential, found.recorded]
-        seen = torch.zeros_like(found.recorded, dtype=torch.bool)
-        for kind in [*kinds, *ends]:
+        seen, whole = (torch.zeros_like(found.recorded, dtype=torch.bool) for _ in range(2))
+        for kind, known in [*((kind, seen) for kind in kinds), *((end, whole) for end in ends)]:
             tile = divmod(int(kind.argmax()), kind.shape[1])
-            if not seen.any() or (bool(kind.any()) and not bool(seen[tile])):
-                top, of_rows = _window(tile[0], len(kind), extent, picture[0])
-                left, of_columns = _window(tile[1], kind.shape[1], extent, picture[1])
-                seen |= of_rows[:, None] & of_columns
+            if not seen.any() or (bool(kind.any()) and not bool(known[tile])):
+                top, *of_rows = _window(tile[0], len(kind), extent, picture[0])
+                left, *of_columns = _window(tile[1], kind.shape[1], extent, picture[1])
+                for tiles, inside, beside in zip((seen, whole), of_rows, of_columns, strict=True):
+                    tiles |= inside[:, None] & beside
                 crops.append((row, top, left))
         covered = [float(kind[seen].sum() / kind.sum()) for kind in kinds if kind.any()]
         factors[row] = math.sqrt(covered[-1] / min(covered)) if covered else 1.0
     return crops, factors
 
 
-def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor]:
-    """Where a window around a tile starts along one side of a picture, and which tiles have their centre in it."""
+def _window(tile: int, count: int, extent: int, length: int) -> tuple[int, Tensor, Tensor]:
+    """Where a window around a tile starts along one side of a picture, which tiles have their centre in it, and which
+    it holds whole: the nearest point may be anywhere in its tile.
+    """
     extent = min(extent, length)
     start = min(max(0, tile * TILE + (TILE - extent) // 2), length - extent)
-    centres = (torch.arange(count) * TILE + TILE // 2).clamp(max=length - 1)
-    return start, (centres >= start) & (centres < start + extent)
+    tops, stop = torch.arange(count) * TILE, start + extent
+    centres, bottoms = (tops + TILE // 2).clamp(max=length - 1), (tops + TILE).clamp(max=length)
+    return start, (centres >= start) & (centres < stop), (tops >= start) & (bottoms <= stop)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -59,6 +60,7 @@ _OVER_LIGHTS = 7.0  # times that of fewer layers: a light between two of them is
 _SEEN_THROUGH = 3.0  # the same where something near is blurred wide, and what is behind it is not: little of that is
 # left, which stands for all that is hidden; but of choices of wavelengths where few lights stand out: 3 to 12 times
 # what they cost would be told of 16 such scenes
+_SEEN_THROUGH_LIGHTS = 8.0  # of others behind which a lamp goes on, a window was told 0.4 times what it costs with 3
 _WIDE = 1 / 8  # of the picture's shorter side, the radius of such a blur
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
 _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
@@ -233,8 +235,14 @@ class Spectra:
     @functools.cached_property
     def _recorded_bands(self) -> Tensor:
         """What is recorded of the scene in each band, (L,)."""
-        spectra = self._recorded_spectra.double().cpu()
-        return (self.scene.coefficients.detach().sum((0, 2, 3)).double().cpu() @ spectra).clamp(min=0)
+        light = self._bands.clamp(min=0)
+        return light if self.weights is None else light * self.weights.abs().sum(0).to(light)
+
+    @functools.cached_property
+    def _bands(self) -> Tensor:
+        """The scene's light in each band, (L,)."""
+        light = self.scene.coefficients.detach().sum((0, 2, 3)).double().cpu()
+        return light if self.scene.spectra is None else light @ self.scene.spectra.double().cpu()
 
     @functools.cached_property
     def _masks(self) -> Spectra:
@@ -322,6 +330,29 @@ class Spectra:
         said = share * hidden * off / even.clamp(min=1e-300)
         return said if lost < _LOST else said / (1 - self._veiled) ** 2
 
+    def behind_edges(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
+        """How much more goes on behind what is nearer, of the light that does, RMS over the channels.
+
+        There light is divided by what its mask leaves, and both are tails of diffraction, as bright as their wavelength
+        is long. Masks are white in each channel; light of a few bands is not, and other PSFs stand for either.
+        """
+        if self.weights is None or self.imaging.accuracy.coverage != "channel":
+            return 0.0
+        white = self.weights.double().cpu().abs()
+        light = white * self._bands.clamp(min=0)
+        power = light.sum(1).square()
+
+        def tails(settings: Mapping[str, Any]) -> Tensor:
+            stage = self.optics.stage(settings)
+            nodes = stage.psf_wavelengths(self.wavelengths, deep=self.optics.deep).double().cpu()
+            shares = stage.shares(self.wavelengths, deep=self.optics.deep)
+            own = nodes if shares is None else shares.to(nodes) @ nodes
+            ours, theirs = (of @ own / of.sum(1).clamp(min=1e-300) for of in (light, white))
+            return ours / theirs.clamp(min=1e-300)
+
+        off = (tails(changes) - tails(against)).square() * power
+        return math.sqrt(float(off.sum() / power.sum().clamp(min=1e-300)))
+
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
         """The same of some rows, and of what hides what: tried out."""
         grey = self.grey.scene.samples(rows)
@@ -405,12 +436,13 @@ class Spectra:
         if not self._hides:
             return torch.ones_like(self._unlike)
         defocus = self.optics.defocus
-        found = torch.where(self.few_lights, _HIDDEN_LIGHTS, _HIDDEN).double()
+        few = self.few_lights
+        found = torch.where(few, _HIDDEN_LIGHTS, _HIDDEN).double()
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
         far, near = (defocus.radius(end) - defocus.floor for end in ends)
         wide = (near > _WIDE * min(self.optics.picture)) & (far < near / 2)
-        return torch.where(wide, _SEEN_THROUGH, found)
+        return torch.where(wide, torch.where(few, _SEEN_THROUGH_LIGHTS, _SEEN_THROUGH), found)
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""

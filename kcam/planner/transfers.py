@@ -49,8 +49,8 @@ _SMOOTH, _SMOOTH_PIXELS = 1.25, 1.5  # times the error of PSFs between others: w
 # 157 without it (2 %, median), and 0.56 of one picture at 0.001
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
 # what models differ in; else it holds more or less by this times (a / d)^2: 0.4 to 1.3 times what 53 maps of pixels do
-_HARDLY, _HARDLY_PIXELS = 0.04, 0.02  # of the light from a distance, that a window holds, below which line spreads do
-# not tell what is in it, 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses; the same of phases of pixels
+_HARDLY = 0.04  # of the light from a distance, that a window holds, below which line spreads do not tell what is in it:
+# 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses, and 0.24 to 0.75 times of a map of noise that lets 3 % in
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -283,7 +283,7 @@ class Transfers:
         """
         if self.fits or self._widest is None:
             return False
-        return bool(self.passed.min() < (_HARDLY_PIXELS if self._widest.has_pixel_phase else _HARDLY))
+        return bool(self.passed.min() < _HARDLY)
 
     @property
     def lost_between_ends(self) -> float:

@@ -341,7 +341,7 @@ def test_a_lamp_between_layers_may_be_in_focus() -> None:
         few, beside = colours.levels[0].changes, colours.beside
         told, raw = planner.evaluator.error(beside | few, beside), noiseless_raw(camera)
         truth = relative_rms(with_imaging(raw, **few)(scene), raw(scene))
-    assert 0.9 < told / truth < 2.5, f"{told:.3g}, truly {truth:.3g}"
+    assert 0.9 < told / truth < 3, f"{told:.3g}, truly {truth:.3g}"
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 
 from benchmarks.planner import worst
 from kcam import Camera, Scene, optics, sensor
-from kcam.planner import Planner, make_plan, noiseless_raw, transfers
+from kcam.planner import Planner, evaluation, make_plan, noiseless_raw, transfers
 from kcam.units import mm, nm, um
 
 TOLERANCES = (0.1, 0.03, 0.01)
@@ -217,6 +218,74 @@ def test_blur_of_less_than_a_pixel_that_differs_between_many_bands(seed: int) ->
     wavelengths = torch.linspace(*draw.one_of((420, 720), (380, 900)), count, dtype=torch.float64) * nm
     imaging = optics.Imaging(lens, pixel_pitch=draw.number(10, 25) * um, fill_factor=draw.one_of(1.0, 0.6))
     check(Camera(imaging), Scene.from_bands(cube, wavelengths=wavelengths, depth=draw.number(0.8, 1.2)))
+
+
+@pytest.mark.parametrize("seed", some(quick=4, slow=24))
+def test_lights_at_one_of_many_distances(seed: int) -> None:
+    """One plane, and few planes of which one is there, blur them as all do, and hide nothing of them, or otherwise."""
+    draw = Draw(seed)
+    focal, size = draw.one_of(25, 50) * mm, draw.one_of(40, 64, 96)
+    lens = optics.Lens(
+        optics.CircularAperture(focal / draw.number(8, 18)),
+        draw.one_of(optics.ThinLens(focal), optics.PlanoConvexLens(0.5185 * focal, glass="N-BK7")),
+        focus_distance=draw.number(0.5, 2),
+    )
+    light = torch.full((1, 3, size, size), draw.one_of(0.0, 0.05))
+    count, nearest = draw.one_of(3, 4, 64), 1 / draw.number(0.4, 0.8)
+    columns = torch.arange(size) * count // size  # distances in bars, or a ramp
+    vergence = torch.linspace(0.2, nearest, count, dtype=torch.float64)[columns]
+    across = draw.whole(size // 4, 3 * size // 4)
+    for _ in range(draw.whole(1, 4)):
+        light[..., draw.whole(2, size - 3), across] = torch.rand(3, generator=draw.generator)
+    depth = (1 / vergence).expand(1, 1, size, size)
+    imaging = optics.Imaging(
+        lens, pixel_pitch=draw.number(2, 6) * um, border=draw.one_of("reflect", "zero", "periodic")
+    )
+    narrow = torch.linspace(540, 544, 3, dtype=torch.float64) * nm  # what colours cost there is another question
+    check(Camera(imaging, *bayer()), Scene.from_bands(light, wavelengths=narrow, depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=24))
+def test_lights_of_which_crops_hold_some(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At distances of their own, the nearest in any part of its tile."""
+    monkeypatch.setattr(evaluation, "LARGEST", 128**2)
+    monkeypatch.setattr(evaluation, "CROP", 64)
+    draw = Draw(seed)
+    lens = optics.Lens(
+        optics.CircularAperture(draw.number(2, 6) * mm), optics.ThinLens(50 * mm), focus_distance=draw.number(0.7, 1.5)
+    )
+    scene = Scene.builtin("chelsea", size=256)
+    _, height, width = scene.shape
+    light, depth = scene.coefficients.clone(), torch.full((1, 1, height, width), 2.1)
+    for _ in range(draw.whole(2, 5)):
+        top, left, side = draw.whole(0, height - 40), draw.whole(0, width - 40), draw.whole(2, 40)
+        depth[..., top : top + side, left : left + side] = draw.number(0.9, 1.9)
+        light[..., top + side // 2, left + side // 2] = draw.number(1, 40)
+    camera = Camera(optics.Imaging(lens, pixel_pitch=6 * um), *bayer())
+    scene = replace(scene, coefficients=light, depth=depth)
+    samples = Planner(camera, scene).evaluator.samples
+    ends = torch.cat([torch.as_tensor(sample.scene.depth).flatten() for sample in samples]).aminmax()
+    assert ends == depth.double().aminmax()
+    check(camera, scene)
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=24))
+def test_light_of_few_bands_at_edges_of_depth(seed: int) -> None:
+    """Masks are white: behind edges light is divided by what they leave, and its colour is blurred otherwise."""
+    draw = Draw(seed)
+    focal, size, count = 16 * mm, draw.one_of(48, 72), draw.whole(5, 16)
+    lens = optics.Lens(
+        optics.CircularAperture(focal / draw.number(3, 6)), optics.ThinLens(focal), focus_distance=draw.number(0.8, 2)
+    )
+    wavelengths = torch.linspace(*draw.one_of((380, 780), (430, 670)), count, dtype=torch.float64) * nm
+    lines = torch.zeros(1, count)
+    lines[:, [draw.whole(0, count - 1) for _ in range(draw.whole(1, 2))]] = 1
+    depth = torch.full((1, 1, size, size), draw.number(1, 2))
+    for _ in range(4):
+        top, left = draw.whole(0, size - 8), draw.whole(0, size - 8)
+        depth[..., top : top + size // 3, left : left + size // 3] = draw.number(0.5, 0.9)
+    scene = Scene(0.2 + light_of(draw, size)[:, :1], spectra=lines, wavelengths=wavelengths, depth=depth)
+    check(Camera(optics.Imaging(lens, pixel_pitch=draw.number(1.2, 3) * um), *bayer()), scene)
 
 
 # ---- stages of one's own -----------------------------------------------------------------------------------------
