@@ -213,6 +213,11 @@ class Evaluator:
         return any(bool(spectra.few_lights.any()) for spectra in self.spectra or ())
 
     @property
+    def of_lines(self) -> bool:
+        """Whether the light of some scene is that of few bands, where that is known."""
+        return any(spectra.of_lines for spectra in self.spectra or ())
+
+    @property
     def left_out(self) -> float:
         """RMS of what the paraxial model leaves out of the phase of any scene [rad]."""
         return max((spectra.optics.left_out for spectra in self.spectra or ()), default=0.0)

@@ -338,7 +338,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     beside = view.few(bands=0, layers=view.around_focus if spread else None)
     query, tabled = view.query, view.evaluator.tabled(beside)
     folded = query is not None and (query.folded() or (query.folded(GAPS) and not tabled))
-    unsteady = folded or view.evaluator.missed
+    unsteady = folded or view.evaluator.missed or (view.evaluator.of_lines and not tabled)
     if unsteady and view.one:
         return  # it takes all PSFs to know: what few cost falls in no order with their number
     successive = view.computed and not (unsteady or tabled)

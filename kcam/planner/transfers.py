@@ -44,9 +44,6 @@ _CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the pi
 _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
 # would be told too little without; few lights may fall into a corner
 _ASKED = (1, FEW_BANDS, ROUND)  # groups of wavelengths, beside which other choices than these are priced
-_SMOOTH, _SMOOTH_PIXELS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than what
-# slices tell of a PSF, and of a map of pixels, of which only some rows are looked at: 0.75 to 1.24 times the truth of
-# 157 without it (2 %, median), and 0.56 of one picture at 0.001
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
 # what models differ in; else it holds more or less by this times (a / d)^2: 0.4 to 1.3 times what 53 maps of pixels do
 _HARDLY = 0.04  # of the light from a distance, that a window holds, below which line spreads do not tell what is in it:
@@ -306,11 +303,6 @@ class Transfers:
             imaging = imaging.changed(renormalise=False)
         passed = self.of(imaging, vergences, wavelengths, Way.LINES)[0][..., 0].real
         return _DIMMER * float(query.tau.detach()) if float(passed.min()) < _MISSED else 0.0
-
-    @functools.cached_property
-    def between_psfs(self) -> float:
-        """Times the error of PSFs that lie between others."""
-        return _SMOOTH_PIXELS if self._widest is not None and self._widest.has_pixel_phase else _SMOOTH
 
     @functools.cached_property
     def corners_of_colours(self) -> float:
