@@ -36,10 +36,10 @@ layers 0.83 to 1 times.
 BRIGHTEST = 4
 """Pixels whose distances count where a few lights stand out."""
 
-SPREAD = 8.0
-"""By how many pixels blur differs from one end of a scene to the other, from which on, and where few lights stand out
-before round optics, wavelengths are priced beside the layers `around_focus`: beside three in even steps lenses were
-told 0.3 to 0.9 of what they cost with all layers, beside these 0.75 to 1.08 times (of 8; one of glass 0.5).
+SPREAD, BY_THREE = 8.0, 1.2
+"""By how many pixels blur differs from one end of a scene to the other, from which on wavelengths cost more than they
+do beside three layers; and times that: beside them 7 lenses were told 0.46 to 0.95 of what they cost with all layers,
+and beside five around what is in focus 0.75 to 1.08, which takes a quarter more of a plan.
 """
 
 BLUR_APART = 1 / 2
@@ -236,21 +236,16 @@ class _View:
         return f"down to {self.imaging.illuminated(self.scene):.0%}"
 
     @property
-    def around_focus(self) -> tuple[float, ...]:
-        """Distances of layers that tell what wavelengths cost: the ends, what is in focus, and halfway to these, or
-        where the brightest of a few lights are.
+    def around_lights(self) -> tuple[float, ...]:
+        """Distances of layers that tell what wavelengths cost a few lights: the ends, what is in focus, and where the
+        brightest are.
         """
         far, near = (float(end) for end in self.vergences.aminmax())
         focus = sum(self.evaluator.defocus.focus) / 2
-        middle = focus if far < focus < near else (far + near) / 2
-        places = {far, middle, near}
-        if self.evaluator.few_lights:
-            energy = self.scene.coefficients.detach().square().sum(1).flatten().cpu()
-            vergence = 1 / torch.as_tensor(self.scene.depth, dtype=torch.float64).detach().cpu()
-            lights = vergence.flatten()[energy.topk(min(BRIGHTEST, len(energy))).indices]
-            places |= set(lights.tolist())
-        else:
-            places |= {(far + middle) / 2, (middle + near) / 2}
+        energy = self.scene.coefficients.detach().square().sum(1).flatten().cpu()
+        vergence = 1 / torch.as_tensor(self.scene.depth, dtype=torch.float64).detach().cpu()
+        lights = vergence.flatten()[energy.topk(min(BRIGHTEST, len(energy))).indices]
+        places = {far, focus if far < focus < near else (far + near) / 2, near, *lights.tolist()}
         return tuple(1 / place if place > 0 else math.inf for place in sorted(places))
 
     def few(
@@ -334,8 +329,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
     lamps = view.query is not None and view.query.symmetric and view.evaluator.few_lights
     pixels = view.query is not None and view.query.has_pixel_phase
-    spread = view.layers > FEW_LAYERS and (lamps or (view.defocused > SPREAD and not pixels))
-    beside = view.few(bands=0, layers=view.around_focus if spread else None)
+    beside = view.few(bands=0, layers=view.around_lights if lamps and view.layers > FEW_LAYERS else None)
     query, tabled = view.query, view.evaluator.tabled(beside)
     folded = query is not None and (query.folded() or (query.folded(GAPS) and not tabled))
     unsteady = folded or view.evaluator.missed or (view.evaluator.of_lines and not tabled)
@@ -347,7 +341,7 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]
     else:
         few = [interpolated(n) for n in node_counts(view.bands)]
-    seams = _behind_edges(view) if deep and view.evaluator.certain and view.imaging.accuracy.occlusion else None
+    spread = "layers" in beside and view.defocused > SPREAD and not (lamps or pixels)
     shallow = view.layers <= FEW_LAYERS
     if view.one and successive and shallow and not view.stand_in:  # half of the PSFs would save what that takes
         few = [changes for changes in few if 3 * changes["bands"] <= view.bands]
@@ -359,21 +353,21 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
         successive=successive,
         orders=QUADRATURE,
         fastest=FASTEST if successive else FASTEST_COLOURS if deep else None,
-        seams=seams,
+        seams=_behind_edges(view, BY_THREE if spread else 1.0) if deep and view.evaluator.certain else None,
     )
 
 
-def _behind_edges(view: _View) -> Callable[[Level, float, float], float]:
-    """What fewer wavelengths err behind edges of depth, in light that is not white: so much of what hiding nothing
-    costs, 1.1 to 1.5 times the truth of lines of light, and next to nothing in others.
+def _behind_edges(view: _View, factor: float) -> Callable[[Level, float, float], float]:
+    """What fewer wavelengths err, times a factor, and behind edges of depth, in light that is not white: there so much
+    of what hiding nothing costs, 1.1 to 1.5 times the truth of lines of light, and next to nothing in others.
     """
     evaluator, most_hidden = view.evaluator, max(view.evaluator.hidden, default=0.0)
 
     def seams(level: Level, error: float, most: float) -> float:
-        off = evaluator.behind_edges(level.changes, {})
+        off = evaluator.behind_edges(level.changes, {}) if view.imaging.accuracy.occlusion else 0.0
         if off * most_hidden < LITTLE * most:
-            return error
-        return math.hypot(error, off * _hidden(view, HIDES_NOTHING, view.few(layers=0)))
+            return error * factor
+        return math.hypot(error * factor, off * _hidden(view, HIDES_NOTHING, view.few(layers=0)))
 
     return seams
 
@@ -436,14 +430,16 @@ def _seams(view: _View, beside: dict[str, Any], *, own: bool) -> Callable[[Level
     """What layers hide otherwise than more of them do: of 11 scenes 0.2 to 1.4 times what hiding nothing costs, times
     1/n less 1/n of all of them. What planes between others miss falls faster.
 
-    own: whether all layers are at distances of the scene. Then, and of one plane, which hides nothing, that may be most
-    of the error, of lights whose own distance is among those of few layers, and is tried out.
+    own: whether all layers are at distances of the scene. Then, and of one plane for a few lights, that may be most of
+    the error, of what lies at a distance of these few layers, and is tried out; one plane for others is told to err 1.1
+    to 4 times what it does (of 100 ramps).
     """
 
     def seams(level: Level, error: float, most: float) -> float:
-        if own or level.fineness == 1:
+        one = level.fineness == 1
+        if own or (one and view.evaluator.few_lights):
             return max(error, _hidden(view, level.changes, beside, own=own))
-        if most >= FINE:
+        if one or most >= FINE:
             return error
         return math.hypot(error, _hidden(view, HIDES_NOTHING, beside) * max(0.0, 1 / level.fineness - 1 / view.layers))
 

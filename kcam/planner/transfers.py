@@ -46,8 +46,9 @@ _CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not
 _ASKED = (1, FEW_BANDS, ROUND)  # groups of wavelengths, beside which other choices than these are priced
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
 # what models differ in; else it holds more or less by this times (a / d)^2: 0.4 to 1.3 times what 53 maps of pixels do
-_HARDLY = 0.04  # of the light from a distance, that a window holds, below which line spreads do not tell what is in it:
-# 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses, and 0.24 to 0.75 times of a map of noise that lets 3 % in
+_HARDLY, _HARDLY_PIXELS = 0.04, 0.025  # of the light from a distance, that a window holds, below which line spreads do
+# not tell what is in it, 0.06 to 0.8 times what wavelengths cost 50 aberrated lenses; the same of phases of pixels, of
+# which a map of noise was told 0.24 to 0.75 times
 _ALIKE, _UNLIKE = 3.0, 1.75  # RMS of what the paraxial model leaves out of the phase [rad], up to which errors of the
 # one model are those of the other; times the error beyond: of 5, a window of 17 pixels was told 0.44 of what it costs
 _AROUND = 4  # pixels around the rays of a PSF, within which there is light that varies with the wavelength
@@ -280,7 +281,7 @@ class Transfers:
         """
         if self.fits or self._widest is None:
             return False
-        return bool(self.passed.min() < _HARDLY)
+        return bool(self.passed.min() < (_HARDLY_PIXELS if self._widest.has_pixel_phase else _HARDLY))
 
     @property
     def lost_between_ends(self) -> float:
