@@ -56,7 +56,7 @@ TOLD_BY_LINES = WINDOW | {"propagator"}
 
 _BETWEEN_PSFS, _BETWEEN_LIGHTS = 1.25, 1.5  # times the error of PSFs between others: what cubics leave is smaller than
 # what slices tell of a PSF, or rows of a map: 0.75 to 1.24 times the truth of 157 without it (2 %, median), 0.56 of one
-# picture at 0.001; few lights show more of it
+# picture at 0.001; of few lights behind maps of pixels, which show more of it
 _HIDDEN = 1.2  # times the error without occlusion: at edges of depth what is hidden is not added up, but replaced
 _HIDDEN_LIGHTS = 1.5  # the same of few lights
 _OVER_LIGHTS = 7.0  # times that of fewer layers: a light between two of them is seen through masks as steep as itself
@@ -425,7 +425,8 @@ class Spectra:
             factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
         factor = factor * more
         if _differ(changes, against, {"interpolate_bands"}):
-            factor = factor * torch.where(self.few_lights, _BETWEEN_LIGHTS, _BETWEEN_PSFS).double()
+            lights = _BETWEEN_LIGHTS if self.optics.has_pixel_phase else _BETWEEN_PSFS
+            factor = factor * torch.where(self.few_lights, lights, _BETWEEN_PSFS).double()
         if PARAXIAL.items() <= changes.items() and PARAXIAL.items() <= against.items():
             factor = factor * self.optics.by_paraxial
         for index, (rows, _) in enumerate(self.groups):

@@ -281,7 +281,7 @@ class Transfers:
         """
         if self.fits or self._widest is None:
             return False
-        return bool(self.passed.min() < (_HARDLY_PIXELS if self._widest.has_pixel_phase else _HARDLY))
+        return bool(self.passed.min() < (_HARDLY_PIXELS if self.has_pixel_phase else _HARDLY))
 
     @property
     def lost_between_ends(self) -> float:
@@ -304,6 +304,11 @@ class Transfers:
             imaging = imaging.changed(renormalise=False)
         passed = self.of(imaging, vergences, wavelengths, Way.LINES)[0][..., 0].real
         return _DIMMER * float(query.tau.detach()) if float(passed.min()) < _MISSED else 0.0
+
+    @property
+    def has_pixel_phase(self) -> bool:
+        """Whether a map of pixels turns the phase."""
+        return self._widest is not None and self._widest.has_pixel_phase
 
     @functools.cached_property
     def corners_of_colours(self) -> float:
