@@ -1,10 +1,11 @@
 """Whether plans keep their word: random pairs of camera and scene, planned at five tolerances and measured.
 
     python -m benchmarks.planner [--random 300] [--hard 100] [--adversarial 200] [--assorted 100] [--strange 200]
-                                 [--start 0] [--out FILE] [--effects]
+                                 [--start 0] [--out FILE] [--effects] [--unseen]
 
 With --effects the same pairs have one to four effects of a sensor's light drawn into them (glare, motion, crosstalk,
-defects, ...), and only whether plans keep their word is measured.
+defects, ...), and only whether plans keep their word is measured. With --unseen that is all, too, of pairs without
+them; their seeds begin where those end by which numbers in the code were chosen (`UNSEEN_FROM`).
 
 It goes on where it stopped: pairs that are in the file of partial results are not measured again. What is drawn:
 `pairs`. An error is the worst of the whole batch and of each item in it.
@@ -33,7 +34,9 @@ SLOW = 5.0  # seconds of a reference picture above which one of each must do
 FIRST = (0.03, 0.01)  # tolerances at which the first picture is timed too: a plan of its own, and the picture
 SEEN, FELT = 0.1, 0.3  # seconds of a reference picture from which on the worst, and the median, of first pictures count
 RESULTS = Path(__file__).parent / "results" / "planner.json"
-EFFECTS = RESULTS.with_name("planner_effects.json")
+EFFECTS, UNSEEN = RESULTS.with_name("planner_effects.json"), RESULTS.with_name("planner_unseen.json")
+UNSEEN_FROM = 20000  # seeds below it were looked at
+TOO_LOW = 0.8  # of an error, that a bound says at least
 COUNTS = {"random": 300, "hard": 100, "adversarial": 200, "assorted": 100, "strange": 200}
 TIMED = ("random", "hard")  # of which a first picture is taken, too
 
@@ -89,10 +92,12 @@ def measure_pair(
     return {"seed": f"{kind} {seed}", "pair": text, "drawn_again": again, "tolerances": rows}
 
 
-def honest_pair(kind: str, seed: int) -> dict[str, Any]:
-    """One pair with effects: for each tolerance the estimate and the truth, the worst of the batch and of its items."""
+def honest_pair(kind: str, seed: int, *, effects: bool) -> dict[str, Any]:
+    """One pair: for each tolerance the estimate and the truth, the worst of the batch and of its items."""
     camera, scene, text, _ = FAMILIES[kind](seed)
-    camera, effects = with_effects(camera, scene, f"{kind}/{seed}")
+    if effects:
+        camera, drawn = with_effects(camera, scene, f"{kind}/{seed}")
+        text = f"{drawn}; {text}"
     rows = []
     with torch.no_grad():
         planner, truth = Planner(camera, scene), noiseless_raw(camera)(scene)
@@ -102,17 +107,17 @@ def honest_pair(kind: str, seed: int) -> dict[str, Any]:
             error = worst(raw, truth)
             left_out = [row.effect for row in plan.decisions if row.chosen == "left out"]
             rows.append({"tolerance": tolerance, "bound": plan.bound, "error": error, "left_out": left_out})
-    return {"seed": f"{kind} {seed}", "pair": f"{effects}; {text}", "tolerances": rows}
+    return {"seed": f"{kind} {seed}", "pair": text, "tolerances": rows}
 
 
-def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
-    """All pairs with effects; goes on where it stopped."""
+def measure_honesty(seeds: Mapping[str, range], out: Path, *, effects: bool) -> None:
+    """Whether plans keep their word, of all pairs; goes on where it stopped."""
     partial = out.with_suffix(".partial.jsonl")
     known = [json.loads(line) for line in partial.read_text().splitlines()] if partial.exists() else []
     done = {pair["seed"]: pair for pair in known}
     for kind, seed in [(kind, seed) for kind, own in seeds.items() for seed in own]:
         if f"{kind} {seed}" not in done:
-            found = done[f"{kind} {seed}"] = honest_pair(kind, seed)
+            found = done[f"{kind} {seed}"] = honest_pair(kind, seed, effects=effects)
             with partial.open("a") as file:
                 file.write(json.dumps(found) + "\n")
             most = max(row["error"] / row["tolerance"] for row in found["tolerances"])
@@ -125,6 +130,7 @@ def measure_effects(seeds: Mapping[str, range], out: Path) -> None:
         content[kind] = {
             "pairs": len(own),
             "outside": sum(row["error"] > row["tolerance"] for row in rows),
+            "bounds_too_low": sum(row["bound"] < TOO_LOW * row["error"] for row in rows if row["error"] > 1e-6),
             "worst": max((row["error"] / row["tolerance"] for row in rows), default=0.0),
             "all": [done[f"{kind} {seed}"] for seed in own],
         }
@@ -172,7 +178,7 @@ def summary(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "predicted_over_measured": statistics.median(predicted),
                 "mispredicted": statistics.median(max(ratio, 1 / ratio) for ratio in predicted),
                 "mispredicted_calibrated": statistics.median(max(ratio, 1 / ratio) for ratio in calibrated),
-                "bounds_too_low": sum(row["bound"] < 0.8 * row["error"] for row in found if row["error"] > 1e-6),
+                "bounds_too_low": sum(row["bound"] < TOO_LOW * row["error"] for row in found if row["error"] > 1e-6),
                 "planning_share": statistics.median(
                     row["planning_seconds"] / row["reference_seconds"] for row in found
                 ),
@@ -212,14 +218,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for kind, count in COUNTS.items():
         parser.add_argument(f"--{kind}", type=int, default=count)
-    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--start", type=int, default=None)
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--effects", action="store_true")
+    parser.add_argument("--unseen", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    seeds = {kind: range(arguments.start, arguments.start + getattr(arguments, kind)) for kind in COUNTS}
-    if arguments.effects:
-        measure_effects(seeds, arguments.out or EFFECTS)
+    start = arguments.start if arguments.start is not None else UNSEEN_FROM if arguments.unseen else 0
+    seeds = {kind: range(start, start + getattr(arguments, kind)) for kind in COUNTS}
+    if arguments.effects or arguments.unseen:
+        measure_honesty(seeds, arguments.out or (EFFECTS if arguments.effects else UNSEEN), effects=arguments.effects)
         return
     arguments.out = arguments.out or RESULTS
     partial = arguments.out.with_suffix(".partial.jsonl")

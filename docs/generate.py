@@ -343,7 +343,7 @@ def field_picture(path: Path) -> None:
 
 PLANS = RESULTS / "plans"
 HONESTY, TRAINING = RESULTS / "planner.json", RESULTS / "planner_training.json"
-EFFECTS_HONESTY = RESULTS / "planner_effects.json"
+EFFECTS_HONESTY, UNSEEN = RESULTS / "planner_effects.json", RESULTS / "planner_unseen.json"
 FAMILIES = ("random", "hard", "adversarial", "assorted", "strange")
 
 
@@ -379,10 +379,34 @@ def promise_tolerance() -> str:
     counts = ", ".join(f"{content[kind]['summary'][0]['pairs']} {kind}" for kind in FAMILIES)
     gains = [figures(row["speed_up"]) for row in content["random"]["summary"]]
     low, high = (content["random"]["summary"][index]["tolerance"] for index in (-1, 0))
+    others = json.loads(UNSEEN.read_text())
+    unseen = [row for kind in FAMILIES for pair in others[kind]["all"] for row in pair["tolerances"]]
+    outside = sum(row["error"] > row["tolerance"] for row in unseen)
     return (
         f"Of pairs of camera and scene, {counts}, at five tolerances from {high:g} to {low:g}, **{inside} of {plans}** "
-        f"stayed inside; over the random ones a picture is {', '.join(gains)} times as fast in the median."
+        f"stayed inside; over the random ones a picture is {', '.join(gains)} times as fast in the median. Of pairs by "
+        f"which no number in the code was chosen {len(unseen) - outside} of {len(unseen)} plans did."
     )
+
+
+def plan_unseen() -> str:
+    """Whether plans keep their word of pairs by which no number in the code was chosen."""
+    content = json.loads(UNSEEN.read_text())
+    found = {kind: content[kind] for kind in FAMILIES}
+    counts = ", ".join(f"{one['pairs']} {kind}" for kind, one in found.items())
+    rows = [row | {"pair": pair["pair"]} for one in found.values() for pair in one["all"] for row in pair["tolerances"]]
+    outside = [row for row in rows if row["error"] > row["tolerance"]]
+    too_low = sum(one["bounds_too_low"] for one in found.values())
+    named = "; ".join(
+        f"{row['pair']}: {scientific(row['error'])} at {row['tolerance']:g}"
+        for row in sorted(outside, key=lambda row: row["error"] / row["tolerance"], reverse=True)
+    )
+    text = (
+        f"All of these were looked at when the numbers in the code were chosen. Of pairs that were not ({counts}, "
+        f"{results_link(UNSEEN)}), **{len(rows) - len(outside)} of {len(rows)}** plans are inside, and {too_low} of "
+        "their bounds are below 0.8 of the truth."
+    )
+    return f"{text} Outside: {named}." if outside else text
 
 
 def plan_effects() -> str:
@@ -975,6 +999,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "honesty": honesty_table,
     "promise_tolerance": promise_tolerance,
     "plan_effects": plan_effects,
+    "plan_unseen": plan_unseen,
     "promise_effects": promise_effects,
     "training": training_table,
     "field": field_table,

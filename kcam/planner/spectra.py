@@ -425,8 +425,8 @@ class Spectra:
             factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
         factor = factor * more
         if _differ(changes, against, {"interpolate_bands"}):
-            lights = _BETWEEN_LIGHTS if self.optics.has_pixel_phase else _BETWEEN_PSFS
-            factor = factor * torch.where(self.few_lights, lights, _BETWEEN_PSFS).double()
+            of_lights = _BETWEEN_LIGHTS if self.optics.has_pixel_phase else _BETWEEN_PSFS
+            factor = factor * torch.where(self.few_lights, of_lights, _BETWEEN_PSFS).double()
         if PARAXIAL.items() <= changes.items() and PARAXIAL.items() <= against.items():
             factor = factor * self.optics.by_paraxial
         for index, (rows, _) in enumerate(self.groups):
