@@ -358,13 +358,14 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
 
 
 def _behind_edges(view: _View, factor: float) -> Callable[[Level, float, float], float]:
-    """What fewer wavelengths err, times a factor, and behind edges of depth, in light that is not white: there so much
-    of what hiding nothing costs, 1.1 to 1.5 times the truth of lines of light, and next to nothing in others.
+    """What fewer wavelengths err, times a factor, and behind edges of depth, in light of few bands: there so much of
+    what hiding nothing costs, 1.1 to 1.5 times the truth; of other light next to nothing.
     """
     evaluator, most_hidden = view.evaluator, max(view.evaluator.hidden, default=0.0)
+    counts = evaluator.of_lines and view.imaging.accuracy.occlusion
 
     def seams(level: Level, error: float, most: float) -> float:
-        off = evaluator.behind_edges(level.changes, {}) if view.imaging.accuracy.occlusion else 0.0
+        off = evaluator.behind_edges(level.changes, {}) if counts else 0.0
         if off * most_hidden < LITTLE * most:
             return error * factor
         return math.hypot(error * factor, off * _hidden(view, HIDES_NOTHING, view.few(layers=0)))
