@@ -77,6 +77,7 @@ bench-augmentation: $(VENV)/dev.stamp
 # tolerances and measured: two hours.
 bench-planner: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.planner
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.planner --unseen --random 50 --hard 15 --adversarial 20 --assorted 40 --strange 40
 
 # Pictures over the field, up to 12 megapixels: an hour. PARTS=methods measures one part anew, the others stay.
 PARTS ?= pictures,growth,methods,gradient
