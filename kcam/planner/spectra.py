@@ -63,7 +63,7 @@ _OVER_LIGHTS = 7.0  # times that of fewer layers: a light between two of them is
 _SEEN_THROUGH = 3.0  # the same where something near is blurred wide, and what is behind it is not: little of that is
 # left, which stands for all that is hidden; but of choices of wavelengths where few lights stand out: 3 to 12 times
 # what they cost would be told of 16 such scenes
-_SEEN_THROUGH_LIGHTS = 8.0  # of others behind which a lamp goes on, a window was told 0.4 times what it costs with 3
+_SEEN_THROUGH_LIGHTS = 8.0  # of windows of a lamp that goes on behind it: told 0.4 times what they cost with 3
 _WIDE = 1 / 8  # of the picture's shorter side, the radius of such a blur
 _EDGES = 0.15  # of what masks say of hidden light, in energy: the rest is in the planes that they cut
 _DROWNED = 1.3  # of `hidden`, from which on masks say more, up to all of it one further
@@ -307,6 +307,9 @@ class Spectra:
             colours, replaced = not _differ(changes, against, LINEAR - COLOURS), self._replaced
             if colours and self._hides:
                 replaced = torch.where(self.few_lights, _HIDDEN_LIGHTS, replaced)
+            elif _differ(changes, against, WINDOW):
+                through = self.few_lights & (replaced == _SEEN_THROUGH)
+                replaced = torch.where(through, _SEEN_THROUGH_LIGHTS, replaced)
             off, all_of_it = self._linear(changes, against, care, replaced)
             if self.hidden is None or not self._hides:
                 return off, all_of_it
@@ -486,13 +489,12 @@ class Spectra:
         if not self._hides:
             return torch.ones_like(self._unlike)
         defocus = self.optics.defocus
-        few = self.few_lights
-        found = torch.where(few, _HIDDEN_LIGHTS, _HIDDEN).double()
+        found = torch.where(self.few_lights, _HIDDEN_LIGHTS, _HIDDEN).double()
         depth = torch.as_tensor(self.scene.depth, dtype=torch.float64).cpu()
         ends = (1 / (depth.flatten(1) if depth.ndim > 1 else depth.view(-1, 1))).aminmax(dim=1)
         far, near = (defocus.radius(end) - defocus.floor for end in ends)
         wide = (near > _WIDE * min(self.optics.picture)) & (far < near / 2)
-        return torch.where(wide, torch.where(few, _SEEN_THROUGH_LIGHTS, _SEEN_THROUGH), found)
+        return torch.where(wide, _SEEN_THROUGH, found)
 
     def _energy(self, mixed: Tensor, layered: _Layered) -> Tensor:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
