@@ -23,6 +23,7 @@ import typer
 from PIL import Image
 
 import kcam
+import kcam.style
 from kcam import augmentation as KC
 from kcam import cli, demo, isp, optics, sensor
 from kcam.camera import PRESETS

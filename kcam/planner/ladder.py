@@ -57,7 +57,7 @@ class Ladder:
     with which power of its step its error falls at most, so that rungs which cannot do are not looked at; None where
     any may do. marks: fineness of the rungs by which others are priced, of successive ones: few, so that these are
     computed once.
-    seams: what a rung errs in all, of layers that hide each other, by what it errs without and what was allowed when it
+    seams: what a rung errs in all, where layers hide each other, by what it errs without and what was allowed when it
     was last priced (`most`): asked for where it may do without.
     least: the error that any rung is said to have, of rounding that its pricing does not see.
     confirmed_beside: other settings, beside which a rung that may do is priced again.
