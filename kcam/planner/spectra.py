@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import enum
 import functools
+import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +31,7 @@ from kcam.optics.numerics import cubic_weights
 from kcam.optics.rendering.depth import alike, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.planner.band_counts import FEW_BANDS
-from kcam.planner.cross_spectra import cross_spectra
+from kcam.planner.cross_spectra import InRings, in_rings
 from kcam.planner.light import UNSEEN, blurred, compressed, contrast, few_lights, hues, lights, recorded
 from kcam.planner.transfers import PARAXIAL, Transfers, Way
 from kcam.scene import Scene
@@ -83,11 +84,11 @@ _SAME_LAYER = 1e-6  # of the range of depth
 @dataclass(frozen=True)
 class _Layered:
     """Of rows that are cut into the same layers: their vergences (Z,), and cross-spectra (B, 2, F, K Z, K Z) of light
-    that runs along x, and y, or the diagonals.
+    that runs along x, and y, or the diagonals; of many planes what these are made of, for each hue of each row.
     """
 
     vergences: Tensor
-    crossed: Tensor
+    light: Tensor | list[list[InRings]]
 
 
 class Care(enum.Enum):
@@ -500,7 +501,9 @@ class Spectra:
         """Of transfer functions (R, K Z, 2, F), recorded, (B,)."""
         at_once = mixed.permute(2, 3, 0, 1)  # (2, F, R, K Z)
         parts = torch.cat([at_once.real, at_once.imag], dim=2) if mixed.is_complex() else at_once
-        return ((parts @ layered.crossed) * parts).sum((1, 2, 3, 4)).clamp(min=0)
+        if isinstance(layered.light, Tensor):
+            return ((parts @ layered.light) * parts).sum((1, 2, 3, 4)).clamp(min=0)
+        return torch.stack([torch.stack([hue.energy(parts) for hue in row]).sum() for row in layered.light])
 
     def _of(self, index: int, layers: Any) -> _Layered:
         key = index, str(layers)
@@ -511,16 +514,11 @@ class Spectra:
             vergences, shares = imaging.layers_of(scene, planes)
             if self.hues is not None:
                 planes = self.hues[self.groups[index][0]].to(planes)
-            planes = planes[:, :, None] if shares is None else planes[:, :, None] * shares[:, None]
-            apart = planes.flatten(1, 2)[:, None] if self.hues is None else planes
+            in_layers = _in_layers(planes, shares, apart=self.hues is not None)
             look = functools.partial(
-                cross_spectra,
-                frequencies=self.frequencies,
-                dark=imaging.border == "zero",
-                turned=self.optics.turned,
+                in_rings, frequencies=self.frequencies, dark=imaging.border == "zero", turned=self.optics.turned
             )
-            crossed = torch.stack([torch.stack([*map(look, own)]).sum(0) for own in apart])
-            self._layered[key] = _Layered(vergences, crossed)
+            self._layered[key] = _Layered(vergences, _crossed(in_layers, look))
         return self._layered[key]
 
     def _cutting(self, scene: Scene, layers: Any) -> Imaging:
@@ -577,6 +575,25 @@ class Spectra:
     def _hides(self) -> bool:
         """Whether one part of the scene may hide another."""
         return self.imaging.accuracy.occlusion and is_deep(self.scene)
+
+
+def _in_layers(planes: Tensor, shares: Tensor | None, *, apart: bool) -> Iterator[Iterable[Tensor]]:
+    """Of each row (B, J, H, W) its light in layers (B, Z, H, W), (J Z, H, W) or each hue apart, one after the other."""
+    for row, light in enumerate(planes):
+        own = None if shares is None else shares[row]
+        if apart:
+            yield (hue[None] if own is None else hue * own for hue in light)
+        else:
+            yield [light if own is None else (light[:, None] * own).flatten(0, 1)]
+
+
+def _crossed(rows: Iterator[Iterable[Tensor]], look: Callable[[Tensor], InRings]) -> Tensor | list[list[InRings]]:
+    """Of the planes (K, H, W) of each row's hues, as `_Layered` has them."""
+    seen = ([*map(look, row)] for row in rows)
+    first = next(seen)
+    if first[0].many_planes:
+        return [first, *seen]
+    return torch.stack([torch.stack([hue.crossed() for hue in row]).sum(0) for row in itertools.chain([first], seen)])
 
 
 def _drowned(hidden: Tensor) -> Tensor:

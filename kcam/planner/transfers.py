@@ -55,6 +55,7 @@ _AROUND = 4  # pixels around the rays of a PSF, within which there is light that
 GAPS = 0.95  # of a pixel's width, that is sensitive, up to which light from all directions folds onto slices: errors
 # of optics that are not round were told 0.4 times what they are
 _FEW_LAYERS = 3  # of which the transfer functions of all wavelengths are found at once
+_HELD = 1e8  # bytes of PSFs that are computed together
 
 
 class Way(Enum):
@@ -219,6 +220,10 @@ class Transfers:
 
     def _of_psfs(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> Tensor:
         pixels = imaging.pixels(window, self._like)
+        each = len(wavelengths) * math.prod(window) * pixels.dtype.itemsize
+        parts = vergences.split(max(1, int(_HELD // each)))
+        if len(parts) > 1:
+            return torch.cat([self._of_psfs(imaging, part, wavelengths, window) for part in parts])
         bank = imaging.bank(Points(vergences), wavelengths, pixels)
         if self.turned:
             return _along_diagonals(bank, self.frequencies)

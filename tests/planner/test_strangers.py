@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from benchmarks.planner import worst
 from kcam import Camera, Scene, optics, sensor
-from kcam.planner import Planner, evaluation, make_plan, noiseless_raw, transfers
+from kcam.planner import Planner, cross_spectra, evaluation, make_plan, noiseless_raw, transfers
 from kcam.units import mm, nm, um
 
 TOLERANCES = (0.1, 0.03, 0.01)
@@ -118,6 +118,24 @@ def test_blur_far_wider_than_the_picture(seed: int) -> None:
         depth = 1 / torch.linspace(1 / depth, 0.4, size * size).view(1, 1, size, size)
     imaging = optics.Imaging(lens, pixel_pitch=draw.number(1, 3.5) * um)
     check(Camera(imaging, *draw.one_of((), bayer())), Scene.from_rgb(light_of(draw, size), depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=1, slow=12))
+def test_far_more_layers_than_a_plan_compares_at_once(seed: int) -> None:
+    """Of which each with each, at every frequency, would take gigabytes: a plan took 22 of them."""
+    draw = Draw(seed)
+    side, focal = draw.whole(16, 28), draw.number(20, 50) * mm
+    lens = optics.Lens(
+        optics.CircularAperture(focal / draw.number(2, 4)),
+        optics.ThinLens(focal),
+        focus_distance=draw.number(0.4, 3.0),
+    )
+    near, far = 1 / draw.number(0.3, 0.5), 1 / draw.number(1.0, 4.0)
+    depth = 1 / (far + (near - far) * torch.rand(1, 1, side, side, generator=draw.generator, dtype=torch.float64))
+    scene = Scene.from_rgb(light_of(draw, side), depth=depth)
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(1.5, 3) * um, border=draw.one_of("reflect", "zero"))
+    assert len(imaging.vergences(scene, depth)) > 2 * cross_spectra.MANY
+    check(Camera(imaging, *bayer()), scene)
 
 
 @pytest.mark.parametrize("seed", some(quick=3, slow=24))
