@@ -15,6 +15,7 @@ from torch import Tensor
 from kcam import Camera, optics
 from kcam.context import Context
 from kcam.optics.numerics import bracketed
+from kcam.optics.rendering import depth as depth_module
 from kcam.optics.rendering.depth import Layers, few_values, layer_shares
 from kcam.optics.rendering.renderer import Renderer
 from kcam.scene import Scene
@@ -404,6 +405,32 @@ def test_a_layer_is_rendered_for_the_items_and_the_part_that_it_is_in() -> None:
     items, share = renderer.reached(part, batch=4)
     assert items == 1
     assert share < 0.1
+
+
+@pytest.mark.parametrize("interpolate", [True, False])
+@pytest.mark.parametrize("seed", range(8))
+def test_of_large_maps_some_rows_and_columns_are_looked_at(
+    seed: int, interpolate: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is found is there, and as far as those are apart; the ends, however small, always."""
+    draw = Draw(seed)
+    batch, height, width = draw.whole(1, 3), draw.whole(20, 60), draw.whole(20, 60)
+    vergence = draw.number(0.5, 2) + torch.linspace(0, 1, width).expand(batch, 1, height, width).clone().double()
+    for end in (0.1, 4.0):  # one pixel each
+        vergence[draw.whole(0, batch - 1), 0, draw.whole(0, height - 1), draw.whole(0, width - 1)] = end
+    layers = torch.linspace(0.1, 4.0, draw.whole(3, 40), dtype=torch.float64)
+    exact = depth_module.places(vergence, layers, interpolate=interpolate)
+    every = draw.whole(2, 5)
+    monkeypatch.setattr(depth_module, "_LOOKED_AT", height * width // every**2)
+    found = depth_module.places(vergence, layers, interpolate=interpolate)
+    assert found[0] is not None
+    assert found[-1] is not None
+    for ours, whole in zip(found, exact, strict=True):
+        if ours is not None:
+            assert whole is not None
+            assert set(ours.items) <= set(whole.items)
+            for (start, stop), (first, last) in ((ours.rows, whole.rows), (ours.columns, whole.columns)):
+                assert first <= start < stop <= last + every
 
 
 def test_a_batch_of_distances_takes_what_its_pictures_take() -> None:

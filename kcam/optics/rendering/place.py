@@ -28,6 +28,12 @@ class Place:
             for own, *where in zip(items.T, *ends, strict=True)
         ]
 
+    def of_every(self, many: int, picture: tuple[int, int]) -> Place:
+        """The same in a picture of which every so many rows and columns were looked at."""
+        pairs = zip((self.rows, self.columns), picture, strict=True)
+        rows, columns = ((many * start, min(n, many * stop)) for (start, stop), n in pairs)
+        return Place(self.items, rows, columns)
+
     def box(self, window: tuple[int, int], picture: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
         """Rows and columns that light of it reaches through PSFs of a window, its mirror images at the borders too."""
         pairs = zip((self.rows, self.columns), window, picture, strict=True)
