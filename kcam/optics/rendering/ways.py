@@ -10,6 +10,7 @@ write what it does with a `Bank`, what it takes, and a row: the choice and a pic
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import KW_ONLY, dataclass, replace
 from math import inf, prod
@@ -19,8 +20,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from kcam.cache import ValueCache, has_derivative
-from kcam.optics.rendering.borders import extend
+from kcam.cache import ValueCache, has_derivative, is_plain
+from kcam.optics.rendering.borders import extend, part
 from kcam.optics.rendering.contraction import contract
 from kcam.optics.rendering.convolution import Convolution, correlate
 
@@ -114,16 +115,34 @@ class Bank:
         """The picture in squares, each blurred with what the window reaches around it; or whole."""
         if self.direct or self.squares == (1, 1):
             return blur(planes)
-        (height, width), (rows, columns), (h, w), (down, across) = self.picture, self.square, self.window, self.squares
-        extended = self.extend(planes)
-        pad = (0, across * columns + w - 1 - extended.shape[-1], 0, down * rows + h - 1 - extended.shape[-2])
-        extended = torch.nn.functional.pad(extended, pad)
-        lefts = range(0, across * columns, columns)
-        parts = [
-            torch.cat([blur(extended[..., i : i + rows + h - 1, j : j + columns + w - 1]) for j in lefts], dim=-1)
-            for i in range(0, down * rows, rows)
-        ]
-        return torch.cat(parts, dim=-2)[..., :height, :width]
+        (height, width), (rows, columns) = self.picture, self.square
+        tops, lefts = range(0, height, rows), range(0, width, columns)
+
+        def square(top: int, left: int) -> Tensor:
+            return blur(self._around(planes, top, left))[..., : height - top, : width - left]
+
+        first = square(0, 0)
+        if not is_plain(first):
+            strips = ([square(top, left) if top or left else first for left in lefts] for top in tops)
+            return torch.cat([torch.cat(strip, dim=-1) for strip in strips], dim=-2)
+        result = first.new_empty(*first.shape[:-2], height, width)  # to join them takes twice the memory
+        for top, left in itertools.product(tops, lefts):
+            own = square(top, left) if top or left else first
+            result[..., top : top + rows, left : left + columns] = own
+        return result
+
+    def _around(self, planes: Tensor, top: int, left: int) -> Tensor:
+        """A square of the picture with what the window reaches around it; the last of a row or column is filled up."""
+        sides, missing = [], []
+        for dim, start, length, m, n in zip((-2, -1), (top, left), self.square, self.window, self.picture, strict=True):
+            before, end = 0 if self.border == "given" else m // 2, min(start + length, n)
+            sides.append((dim, start - before, end - before + m - 1))
+            missing.append(start + length - end)
+        within = {dim: start >= 0 and stop <= planes.shape[dim] for dim, start, stop in sides}
+        for dim, start, stop in sorted(sides, key=lambda side: not within[side[0]]):  # what copies comes last
+            inside = planes.narrow(dim, start, stop - start) if within[dim] else None
+            planes = part(planes, start, stop, self.border, dim=dim) if inside is None else inside
+        return torch.nn.functional.pad(planes, (0, missing[1], 0, missing[0])) if any(missing) else planes
 
 
 class Takes(NamedTuple):
