@@ -159,6 +159,32 @@ def test_distances_take_what_others_have_found(kind: str, seed: int, monkeypatch
     torch.testing.assert_close(each(FREQUENCIES, query.shape, range(3))[0], found[3], rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize("paraxial", [True, False])
+@pytest.mark.parametrize("seed", range(6))
+def test_of_maps_only_what_rows_and_nodes_take_is_computed(
+    seed: int, paraxial: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of fine maps before windows of any size: the same as if all of it were."""
+    draw = Draw(seed)
+    size = draw.whole(100, 260)
+    fine = optics.DOE(
+        draw.number(1, 6) * torch.nn.functional.avg_pool2d(draw.noise(1, 1, size + 8, size + 8), 9, 1)[0, 0]
+    )
+    stop = optics.CircularAperture(draw.number(2, 6) * mm)
+    lens = optics.Lens(stop, optics.ThinLens(25 * mm), fine, focus_distance=2.0)
+    vergences = torch.tensor([0.4, 0.7], dtype=torch.float64)
+    shape = draw.one_of((97, 129), (193, 129), (129, 129))
+    pixels = PixelGrid(draw.number(2, 5) * um, shape, 1.0, True, torch.float64)
+    wavelengths = torch.tensor([450.0, 640.0], dtype=torch.float64) * nm
+    query = lens.question(Points(vergences), wavelengths, pixels).modelled(paraxial=paraxial)
+    parts = lines.LineTransfer(query)
+    monkeypatch.setattr(lines, "_MOST", 0.0)
+    whole = lines.LineTransfer(query)
+    assert len(parts.spreads.maps.parts) > len(whole.spreads.maps.parts) == 1
+    found, expected = (told(FREQUENCIES, shape, range(2)) for told in (parts, whole))
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+
+
 def test_in_focus_they_are_the_autocorrelation_of_the_disc() -> None:
     """2 / pi (arccos v - v sqrt(1 - v^2)), v = f lambda d / 2a, times the pixel's sinc (Goodman, 6.34)."""
     lens = optics.Lens(optics.CircularAperture(4 * mm), optics.ThinLens(50 * mm), focus_distance=math.inf)

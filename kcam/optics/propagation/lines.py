@@ -37,10 +37,15 @@ _FAR = 2 / 3  # of the semi-aperture, squared: there pixels are displaced most
 _PASSED = 24  # half width of the low-pass along v, in samples at its Nyquist
 _PER_CYCLE = 4  # parts of a pixel for each cycle of the low-pass in it, and places for each cycle of the phase
 _SOFT = 2.0  # pixels over which rays fade at the window's edge
+_TOGETHER, _NODES, _MOST = 8, 32, 0.7  # rows, and nodes, whose parts of the cells are taken at once, where these parts
+# are less than so much of all
 _TAPS = range(-1, 3)
 _SPHERES = 3  # between which others lie: they rise with the third power of the vergence
 _AT_ONCE = 2**17  # samples of rows, of wavelengths that are transformed together: a processor's cache holds no more
 _MORE = 1.3  # times the samples that are needed, up to which those of other distances do
+
+Parts = list[tuple[slice, slice]]
+"""Rows of a matrix, and the columns in which they are not 0."""
 
 
 def lines(query: Query, like: LineTransfer | None = None) -> LineTransfer | None:
@@ -151,7 +156,8 @@ class _Spreads:
                 edges = None if self.maps is None else self.maps.edges
                 onto = [] if edges is None else [_OntoRows.of(own, *axis, edges) for axis in enumerate(self.rows)]
                 self.lit[some] = [rows.at(own) for rows in self.pupils], onto
-            step = max(1, _AT_ONCE // (len(some) * self.length * max(map(len, self.rows))))
+            each = len(some) * self.length * max(map(len, self.rows))
+            step = max(1, _AT_ONCE // max(each, 0 if self.maps is None else self.maps.amplitude.numel()))
             for part in (lacking[start : start + step] for start in range(0, len(lacking), step)):
                 found = self._spread(query.wavelengths[part], part, *self.lit[some])
                 self.known.update(
@@ -199,8 +205,8 @@ class _Maps:
     """All pixel maps of a lens on common cells; see `cells.Cells`, which cuts them by the rim too.
 
     phases: (E, C, C), their factors (E, L). amplitude: (C, C). edges: of the cells in the image-side plane, (1, C + 1),
-    and onto_nodes: (1, N, C); where cells are curved, those on the axis and at `_FAR` from it, of which others take
-    shares (2, C).
+    and onto_nodes: (1, N, C), with `parts` that are not 0; where cells are curved, those on the axis and at `_FAR` from
+    it, of which others take shares (2, C).
     """
 
     phases: Tensor
@@ -209,6 +215,7 @@ class _Maps:
     edges: Tensor
     onto_nodes: Tensor
     shares: Tensor | None
+    parts: Parts
 
     @staticmethod
     def of(query: Query, nodes: Tensor) -> _Maps:
@@ -230,32 +237,46 @@ class _Maps:
         curved = [to_image_side(true, tau, aside=far) for far in ((0.0, _FAR) if tau else (0.0,))]
         onto_nodes = torch.stack([pixel_weights(own, nodes.cpu(), spacing=spacing) for own in curved]).to(amplitude)
         shares, edges = _shares((true[1:] + true[:-1]) / 2).to(amplitude) if tau else None, torch.stack(curved)
-        return _Maps(
-            torch.stack(phases), torch.stack(factors), amplitude, edges.to(query.device), onto_nodes, shares
-        )
+        parts, edges = _parts((onto_nodes != 0).any(0), _NODES), edges.to(query.device)
+        return _Maps(torch.stack(phases), torch.stack(factors), amplitude, edges, onto_nodes, shares, parts)
 
     def fields(self, bands: list[int], rows: Sequence[Tensor], onto: Sequence[_OntoRows]) -> list[Tensor]:
         """What the maps do to the light of wavelengths in rows along x, and in columns along y, (L, Z, R, N)."""
-        cosine, sine = sines(torch.einsum("el,eyx->lyx", self.factors[:, bands], self.phases))
-        field, found = torch.complex(cosine * self.amplitude, sine * self.amplitude), []
+        phase = torch.einsum("el,eyx->lyx", self.factors[:, bands], self.phases)
+        field = torch.stack(sines(phase)).mul_(self.amplitude)
+        return [
+            self._in_rows(own, across(bands), across.parts, places)
+            for places, across, own in zip(rows, onto, (field, field.mT), strict=True)
+        ]
+
+    def _in_rows(self, field: Tensor, taken: Tensor, parts: Parts, places: Tensor) -> Tensor:
+        """In rows at places, of a field's real and imaginary part (2, L, C, C), of which they take (L, K, Z, R, C)."""
         nodes, cells = self.onto_nodes.shape[1:]
-        for places, across, turned in zip(rows, onto, (field, field.mT), strict=True):
-            taken = across(bands)
-            shape, light = taken.shape[2:4], taken.flatten(2, 3)
-            if self.shares is not None:
-                some = (light @ (turned[:, None] * self.shares[:, None])).sum(1, keepdim=True)
-                shares = _shares(places).to(self.amplitude).repeat(1, shape[0])[..., None]
-                some = self._onto_nodes(some * shares).sum(1)
-            elif light.shape[2] * (4 * cells + 2 * nodes) < 2 * nodes * (cells + 2 * light.shape[2]):
-                some = self._onto_nodes(light[:, 0] @ turned)
+        shape, reached, spread = taken.shape[2:4], _area(parts) / len(places), _area(self.parts)
+        # what is taken goes onto nodes, or the field: the fewer multiplications, two of complex numbers for one of real
+        late = shape.numel() * (2 * reached * (cells - nodes) + spread) < cells * spread or self.shares is not None
+        field = torch.complex(*field) if late else self._onto_nodes(field)
+        found = []
+        for own, some in parts:
+            light = taken[..., own, some].flatten(2, 3)
+            if self.shares is None:
+                seen = light[:, 0] @ field[:, some]
             else:
-                some = light[:, 0] @ self._onto_nodes(turned)
-            found.append(some.unflatten(1, shape))
-        return found
+                seen = (light @ (field[:, None, some] * self.shares[:, None])).sum(1)
+            found.append(seen.unflatten(1, (shape[0], -1)))
+        light = torch.cat(found, dim=2).flatten(1, 2)
+        if self.shares is not None:
+            shares = _shares(places).to(self.amplitude).repeat(1, shape[0])[..., None]
+            light = self._onto_nodes(_apart(light[:, None] * shares)).sum(1)
+        elif late:
+            light = self._onto_nodes(_apart(light))
+        return light.unflatten(1, shape)
 
     def _onto_nodes(self, light: Tensor) -> Tensor:
+        """Of the real and the imaginary part of light in cells, (2, ..., C): (..., N)."""
         weights = self.onto_nodes if self.shares is not None else self.onto_nodes[0]
-        return torch.complex(*(torch.stack([light.real, light.imag]) @ weights.mT))
+        parts = [light[..., cells] @ weights[..., nodes, cells].mT for nodes, cells in self.parts]
+        return torch.complex(*torch.cat(parts, dim=-1))
 
     def power(self, rows: Tensor, nodes: Tensor, axis: int) -> Tensor:
         """What passes of the power in the rows along x, or the columns along y, (R, N)."""
@@ -350,7 +371,7 @@ class _OntoRows:
 
     fringes: see `_fringes`. offset: from each row to the middles of P parts of each cell (K, R, P, C), and how wide
     these are (K, C), in semi-apertures. coefficients, maps: see `residual_path`; at places in each part
-    (T, K, P, Q, C), and in the rows, (T, K, R).
+    (T, K, P, Q, C), and in the rows, (T, K, R). parts: rows, and the cells of which they take something.
     """
 
     query: Query
@@ -360,6 +381,7 @@ class _OntoRows:
     coefficients: Tensor
     maps: Tensor
     in_rows: Tensor
+    parts: Parts
 
     @staticmethod
     def of(query: Query, axis: int, rows: Tensor, edges: Tensor) -> _OntoRows:
@@ -372,7 +394,9 @@ class _OntoRows:
         maps, in_rows = found.tensor_split([found.shape[-1] - len(rows)], dim=-1)
         offset, widths = _middles(edges, parts)[:, None] - rows[:, None, None], edges.diff() / parts
         maps, dtype = maps.unflatten(-1, (parts, places, -1)), query.dtype
-        return _OntoRows(query, fringes, offset.to(dtype), widths.to(dtype), coefficients, maps, in_rows)
+        near = (offset.abs() * fringes < _PASSED * float(query.wavelengths.max())).any(0).any(1)
+        few = _parts(near, _TOGETHER)
+        return _OntoRows(query, fringes, offset.to(dtype), widths.to(dtype), coefficients, maps, in_rows, few)
 
     def __call__(self, bands: list[int]) -> Tensor:
         """Of wavelengths, (L, K, Z, R, C): but for a phase of each row, which no power has."""
@@ -390,6 +414,26 @@ class _OntoRows:
             return taken
         back = torch.complex(*(part.to(weights) for part in sines(_at(-phase, self.in_rows))))
         return taken * back[..., None]
+
+
+def _parts(taken: Tensor, count: int) -> Parts:
+    """So many of the rows (R, C) at once, and the columns of which they take something; all where that is most."""
+    rows, columns = taken.shape
+    found = []
+    for start in range(0, rows, count):
+        some = taken[start : start + count].any(0).nonzero()[:, 0].tolist() or [0]
+        found.append((slice(start, min(rows, start + count)), slice(some[0], some[-1] + 1)))
+    return found if _area(found) < _MOST * rows * columns else [(slice(0, rows), slice(0, columns))]
+
+
+def _area(parts: Parts) -> int:
+    """Entries of a matrix, (R, C), in its parts."""
+    return sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in parts)
+
+
+def _apart(light: Tensor) -> Tensor:
+    """Real and imaginary part."""
+    return torch.stack([light.real, light.imag])
 
 
 def _at(phase: Tensor, maps: Tensor) -> Tensor:
