@@ -451,8 +451,12 @@ class ColourFilter(Stage):
             return planes
         height, width = planes.shape[-2:]
         rows, columns, _ = alpha.shape
-        sensor = alpha.to(planes).permute(2, 0, 1).repeat(1, -(-height // rows), -(-width // columns))
-        return (planes * sensor[:, :height, :width]).sum(-3, keepdim=True)
+        across = alpha.to(planes).permute(2, 0, 1).repeat(1, 1, -(-width // columns))[..., :width]  # (K, rows, W)
+        tiled = height - height % rows
+        parts = [_sums(planes[..., :tiled, :].unflatten(-2, (-1, rows)), across)] if tiled else []
+        if tiled < height or not parts:
+            parts.append(_sums(planes[..., None, tiled:, :], across[:, : height - tiled]))
+        return torch.cat([part.flatten(-3, -2) for part in parts], dim=-2).unsqueeze(-3)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """Bands (B,L,H,W) at the context's wavelengths to channels (B,C,H,W), or to the tile's plane (B,1,H,W).
@@ -487,6 +491,14 @@ class ColourFilter(Stage):
             first, last = (float(end) / nm for end in self.nodes[[0, -1]])
             of = f", {first:.0f}..{last:.0f} nm{', photons=True' if self.photons else ''}"
         return f"{tuple(self.coefficients.shape)}, softplus={self.softplus}{of}{cut}"
+
+
+def _sums(planes: Tensor, weights: Tensor) -> Tensor:
+    """Of planes (..., K, Y, R, W) with weights (K, R, W), one plane after the other, (..., Y, R, W): a product of all
+    would be as large as they are.
+    """
+    first, *others = zip(planes.unbind(-4), weights, strict=True)
+    return functools.reduce(lambda total, pair: torch.addcmul(total, *pair), others, torch.mul(*first))
 
 
 def _shares(wavelengths: Tensor) -> Tensor:
