@@ -418,8 +418,8 @@ def plan_effects() -> str:
     worst = max(one["worst"] for one in found.values())
     return (
         "With one to four of glass, glare, motion, micro-lens shading, crosstalk, defects, banding and a bent response "
-        f"drawn into the camera ({counts} pairs, at the same five tolerances), {outside} plans were outside; the worst "
-        f"came to {worst:.2f} of its tolerance, and {low} bounds were below 0.8 of the error "
+        f"drawn into the camera ({counts} pairs, at the same five tolerances), plans outside: {outside}; the worst "
+        f"came to {worst:.2f} of its tolerance, and bounds below 0.8 of the error: {low} "
         f"({results_link(EFFECTS_HONESTY)})."
     )
 

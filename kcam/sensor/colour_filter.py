@@ -452,11 +452,11 @@ class ColourFilter(Stage):
         height, width = planes.shape[-2:]
         rows, columns, _ = alpha.shape
         across = alpha.to(planes).permute(2, 0, 1).repeat(1, 1, -(-width // columns))[..., :width]  # (K, rows, W)
-        tiled = height - height % rows
-        parts = [_sums(planes[..., :tiled, :].unflatten(-2, (-1, rows)), across)] if tiled else []
-        if tiled < height or not parts:
-            parts.append(_sums(planes[..., None, tiled:, :], across[:, : height - tiled]))
-        return torch.cat([part.flatten(-3, -2) for part in parts], dim=-2).unsqueeze(-3)
+        whole, last = planes.split([height - height % rows, height % rows], dim=-2)  # of rows of tiles
+        parts = [_sums(whole.unflatten(-2, (-1, rows)), across)] if whole.shape[-2] or not height else []
+        parts += [_sums(last[..., None, :, :], across[:, : last.shape[-2]])] if last.shape[-2] else []
+        found = [part.flatten(-3, -2) for part in parts]
+        return (torch.cat(found, dim=-2) if len(found) > 1 else found[0]).unsqueeze(-3)
 
     def forward(self, signal: Tensor, context: Context | None = None) -> Tensor:
         """Bands (B,L,H,W) at the context's wavelengths to channels (B,C,H,W), or to the tile's plane (B,1,H,W).
@@ -495,10 +495,15 @@ class ColourFilter(Stage):
 
 def _sums(planes: Tensor, weights: Tensor) -> Tensor:
     """Of planes (..., K, Y, R, W) with weights (K, R, W), one plane after the other, (..., Y, R, W): a product of all
-    would be as large as they are.
+    would be as large as they are. In float32 at least.
     """
-    first, *others = zip(planes.unbind(-4), weights, strict=True)
-    return functools.reduce(lambda total, pair: torch.addcmul(total, *pair), others, torch.mul(*first))
+    wide = torch.promote_types(planes.dtype, torch.float32)
+    first, *others = zip(planes.unbind(-4), weights.to(wide), strict=True)
+
+    def add(total: Tensor, pair: tuple[Tensor, Tensor]) -> Tensor:
+        return torch.addcmul(total, pair[0].to(wide), pair[1])
+
+    return functools.reduce(add, others, first[0].to(wide) * first[1]).to(planes.dtype)
 
 
 def _shares(wavelengths: Tensor) -> Tensor:

@@ -177,12 +177,15 @@ def test_of_maps_only_what_rows_and_nodes_take_is_computed(
     pixels = PixelGrid(draw.number(2, 5) * um, shape, 1.0, True, torch.float64)
     wavelengths = torch.tensor([450.0, 640.0], dtype=torch.float64) * nm
     query = lens.question(Points(vergences), wavelengths, pixels).modelled(paraxial=paraxial)
-    parts = lines.LineTransfer(query)
-    monkeypatch.setattr(lines, "_MOST", 0.0)
-    whole = lines.LineTransfer(query)
-    assert len(parts.spreads.maps.parts) > len(whole.spreads.maps.parts) == 1
-    found, expected = (told(FREQUENCIES, shape, range(2)) for told in (parts, whole))
-    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+    told = []
+    for most in (1.1, 0.0):
+        monkeypatch.setattr(lines, "_MOST", most)
+        own = lines.LineTransfer(query)
+        told.append(own(FREQUENCIES, shape, range(2)))
+        ((_, onto),) = own.spreads.lit.values()
+        for parts in (own.spreads.maps.parts, *(rows.parts for rows in onto)):
+            assert (len(parts) > 1) == (most > 0)
+    torch.testing.assert_close(*told, rtol=0, atol=2e-6)
 
 
 def test_in_focus_they_are_the_autocorrelation_of_the_disc() -> None:

@@ -1071,13 +1071,16 @@ def test_what_falls_into_the_picture_is_told_without_it(seed: int) -> None:
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("dark", [True, False])
 @pytest.mark.parametrize("seed", range(6))
-def test_cross_spectra_are_sums_over_rings(seed: int, dark: bool, turned: bool) -> None:
+def test_cross_spectra_are_sums_over_rings(
+    seed: int, dark: bool, turned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of each ring those of its frequencies, of all together the planes' inner products; what is mirrored runs along
     both diagonals.
     """
     draw = Draw(seed)
     height, width, frequencies = draw.whole(1, 70), draw.whole(1, 70), cross_spectra.rings()
     planes = draw.noise(draw.whole(1, 5), height, width).float()
+    monkeypatch.setattr(cross_spectra, "_AT_ONCE", draw.one_of(1, 100, 2**23))
     found = cross_spectra.cross_spectra(planes, frequencies, dark=dark, turned=turned)
     mixed = draw.noise(2, len(frequencies), draw.whole(1, 4), len(planes)).double()
     energy = cross_spectra.in_rings(planes, frequencies, dark=dark, turned=turned).energy(mixed)
