@@ -442,6 +442,29 @@ def test_of_large_maps_some_rows_and_columns_are_looked_at(
                 assert ours.columns[1] >= every * (seen.columns[1] - 1) + 1
 
 
+def test_a_batch_of_distances_takes_what_its_pictures_take() -> None:
+    """Each picture's map is in layers of its own, of which the others have nothing."""
+    depth = torch.linspace(0.5, 2.0, 6)[:, None, None, None].expand(6, 1, 32, 32).clone()
+    depth[..., 16:] *= 1.01
+    scene = Scene(Draw(1).noise(6, BANDS, 32, 32).abs(), wavelengths=wavelength_grid(count=BANDS), depth=depth)
+    stage = optics.Imaging(random_lens(Draw(1), "ideal"), pixel_pitch=4 * um)
+    together = stage.work(scene).operations["transform"]
+    alone = sum(stage.work(scene.samples([row])).operations["transform"] for row in range(6))
+    assert together < 1.5 * alone
+    with torch.no_grad():
+        light = stage(scene)
+        for row in range(6):
+            one = scene.samples([row])
+            layers = tuple((1 / stage.depth_layers(depth, scene.wavelengths)).tolist())
+            torch.testing.assert_close(light[row : row + 1], stage.changed(layers=layers)(one), rtol=1e-5, atol=1e-6)
+
+
+def test_a_zone_without_any_layer_is_dark() -> None:
+    shares = torch.zeros(1, 2, 20, 24)
+    renderer = Renderer(torch.ones(2, 1, 5, 5) / 25, spectra=None, weights=None, picture=(20, 24), border="zero")
+    assert torch.equal(laid(torch.ones(1, 1, 20, 24), shares, renderer, occlusion=True), torch.zeros(1, 1, 20, 24))
+
+
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
 def test_layers_under_vmap() -> None:
     planes, shares, renderer, _ = scattered(Draw(3))
