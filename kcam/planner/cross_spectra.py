@@ -15,7 +15,7 @@ _FINEST, _FINE, _STEP = 2.0**-10, 2.0**-4, 2.0**-7  # cycles per pixel: rings ar
 _EDGE = 2.0**-6  # and in the corners of the pixels' frequencies
 _PART = 32  # frequencies that are summed at once
 _AT_ONCE = 2**23  # numbers that are computed together
-MANY = 48  # planes
+MANY = 48  # planes, of more of which what cross-spectra are made of is kept instead
 _DARK = 1.5  # sides of a picture, with the dark beside it: errors are 0.96 to 1.08 times those with 4 sides (5 to 95 %)
 
 
@@ -41,7 +41,7 @@ class InRings:
 
     @property
     def many_planes(self) -> bool:
-        """Whether there are so many planes that their cross-spectra take longer than what is asked of them."""
+        """Whether cross-spectra of so many planes take longer, and more memory, than what they are made of."""
         return self.parts.shape[1] > MANY
 
     def crossed(self) -> Tensor:

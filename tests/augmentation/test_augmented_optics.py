@@ -57,7 +57,9 @@ class TestDefocus:
                 window = augmentation.window((light.shape[-2], light.shape[-1]), half)
                 options = {"layers": augmentation.layers, "psf_shape": window}
             own = alone(drawn, index)
-            return imaged(lens, light, augmentation=augmentation, wavelengths=grid, depth=depth, drawn=own, **options)
+            return imaged(
+                lens, light, augmentation=augmentation, wavelengths=grid, depth=depth, drawn=own, **options
+            )
 
         return render
 

@@ -506,7 +506,9 @@ def test_light_belongs_to_a_call() -> None:
     stages = KC.RandomExposure(stops=0.5, p=1.0), KC.RandomVignetting(p=1.0, field=60.0, shade=0.2)
     pipeline, found = KC.CameraSequential(*stages), {}
     pictures = [torch.rand(2, 3, 48, 48, generator=torch.Generator().manual_seed(seed)) for seed in range(8)]
-    threads = [threading.Thread(target=lambda i=i, x=x: found.update({i: pipeline(x)})) for i, x in enumerate(pictures)]
+    threads = [
+        threading.Thread(target=lambda i=i, x=x: found.update({i: pipeline(x)})) for i, x in enumerate(pictures)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:

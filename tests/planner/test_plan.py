@@ -234,7 +234,9 @@ def test_adversarial_pairs_of_all_sizes_stay_inside_the_tolerance(seed: int) -> 
     assert_inside(shot, light, (0.1, 0.01, 0.001), text)
 
 
-@pytest.mark.parametrize("seed", [0, 2, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, *range(200, 224)))])
+@pytest.mark.parametrize(
+    "seed", [0, 2, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, *range(200, 224)))]
+)
 def test_assorted_pairs_stay_inside_the_tolerance(seed: int) -> None:
     """Apertures, elements, options and light as they are seldom put together."""
     shot, light, text, _ = assorted_pair(seed, sides=(32, 48, 64))

@@ -18,7 +18,7 @@ from kcam.scene import Scene
 
 LAYER_WAVES = 0.125  # defocus between neighbouring depth layers
 _COMPARED = 16  # different values, of which each pixel is told by comparing; with more sorting takes less time
-_LOOKED_AT = 2**22  # pixels of a map, up to which all are looked at
+_LOOKED_AT = 2**20  # pixels of a large map that are looked at, at least
 _COVERAGE_FLOOR = 1e-4  # below it a layer is hidden by nearer ones, and its share is lost in the FFT's rounding
 
 
@@ -108,11 +108,11 @@ def _positions(vergence: Tensor, layers: Tensor, *, interpolate: bool) -> Tensor
 def places(vergence: Tensor, layers: Tensor, *, interpolate: bool = True) -> list[Place | None]:
     """Where there is anything in each layer, without the shares. Args: as of `layer_shares`.
 
-    Of maps of `_LOOKED_AT` pixels and more every so many rows and columns are looked at, and what is farthest and
+    Of large maps every so many rows and columns are looked at, `_LOOKED_AT` pixels at least, and what is farthest and
     nearest: a layer between that is found nowhere else is left out.
     """
     height, width = vergence.shape[-2:]
-    every = max(1, math.isqrt(4 * height * width // _LOOKED_AT))
+    every = max(1, math.isqrt(height * width // _LOOKED_AT))
     found = _found(vergence[..., ::every, ::every], layers, interpolate=interpolate)
     if every == 1:
         return found

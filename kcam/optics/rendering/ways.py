@@ -140,8 +140,10 @@ class Bank:
             missing.append(start + length - end)
         within = {dim: start >= 0 and stop <= planes.shape[dim] for dim, start, stop in sides}
         for dim, start, stop in sorted(sides, key=lambda side: not within[side[0]]):  # what copies comes last
-            inside = planes.narrow(dim, start, stop - start) if within[dim] else None
-            planes = part(planes, start, stop, self.border, dim=dim) if inside is None else inside
+            if within[dim]:
+                planes = planes.narrow(dim, start, stop - start)
+            else:
+                planes = part(planes, start, stop, self.border, dim=dim)
         return torch.nn.functional.pad(planes, (0, missing[1], 0, missing[0])) if any(missing) else planes
 
 
