@@ -66,7 +66,7 @@ def test_a_wave_is_carried_to_the_image_side(tau: float, frequency: tuple[float,
     count = 256
     spacing = grid_spacing(count)
     like = {"dtype": torch.float64, "device": torch.device("cpu")}
-    warp = Warp.build(count, spacing=spacing, tau=tau, corner=1.05, **like)
+    warp = Warp.build(count, spacing=spacing, tau=tau, round=True, **like)
     assert warp is not None
     nodes = grid_nodes(count, spacing=spacing)
     x, y = nodes[None, :], nodes[:, None]

@@ -254,8 +254,8 @@ def _warp(query: Query, tau: float, *, count: int, spacing: float, curved: bool)
     """The way from the true pupil plane to the image-side plane, where the kernel needs it."""
     if curved or query.paraxial:
         return None
-    corner = 1.05 if query.lens.round else 1.05 * math.sqrt(2)
-    return Warp.build(count, spacing=spacing, tau=tau, corner=corner, dtype=query.dtype, device=query.device)
+    round = query.lens.round
+    return Warp.build(count, spacing=spacing, tau=tau, round=round, dtype=query.dtype, device=query.device)
 
 
 def _error(query: Query, *, method: str) -> float:

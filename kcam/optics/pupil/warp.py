@@ -1,131 +1,181 @@
 """From the true pupil plane, where a map's pixels are straight, to the image-side plane, where the kernel is.
 
 The field there is band-limited and its samples hardly move (by 0.19 tau semi-apertures at most), so they are
-interpolated along x, then along y, by a Kaiser-windowed sinc. Its weights are a short Chebyshev series in the
-displacement: a few banded matrix products, the same for all wavelengths on one grid.
+interpolated along x, then along y, by a Kaiser-windowed sinc. Nodes beside each other move about alike: the weights of
+a tile of them are a short power series in what each moves beyond the tile's middle, one small matrix product for all
+terms, the same for all wavelengths on one grid.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 import torch
+from numpy.polynomial import chebyshev
 from torch import Tensor
 
-from kcam.optics.numerics import lagrange
-from kcam.optics.pupil.banded import pieces, slab_width
+from kcam.optics.numerics import Pair, lagrange
+from kcam.optics.pupil.banded import slab_width
 from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.rim import kaiser_sinc
 
-_SLAB = 64  # columns: narrow enough to leave out most zeros, wide enough for a matrix product
+_ALONG = 32  # nodes of a tile: narrow enough to leave out most zeros, wide enough for a matrix product
+_STEEPEST = 4.0  # tau times those, at most: what moves differ by along a tile is then about
+_WIDEST = 3.0  # samples, what they may differ by across it
+_MOST_TERMS = 28
 _HALF_WIDTH = 16  # samples; half width of the interpolating sinc
 _BETA = 10.4  # both passes: 4e-6 of a field's mean off, 6e-5 at 0.76 of the Nyquist frequency; kappa 2.5 needs 0.8
 _SMALLEST = 3e-5  # coefficient of the series that is kept
-_MOST_TERMS = 64
+_CORNER2 = 1.05**2  # of the radius up to which moves are right: beyond the rim is no light
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """Nodes `along` the axis of a pass and `across` it, interpolated from the nodes `source` along it.
+
+    weights: of each power of their moves, (terms * along, source).
+    """
+
+    along: slice
+    across: slice
+    source: slice
+    weights: Tensor
 
 
 @dataclass(frozen=True)
 class Warp:
     """Linear map (N, N) -> (N, N) by interpolation along rows, then along columns.
 
-    slabs: (band, terms * columns), one for each slab of columns, for both passes; starts: of the bands.
-    displacements: (N, N) in units of the largest, in which the series are Chebyshev's, for each pass.
+    tiles: of the nodes that light passes, for both passes. moves: of each node beyond the middle of its tile [samples],
+    of each pass, the axis of the pass first, (2, N, N).
     """
 
-    slabs: tuple[Tensor, ...]
-    starts: tuple[int, ...]
-    terms: int
-    displacements: tuple[Tensor, Tensor]
+    tiles: tuple[_Tile, ...]
+    moves: Tensor
 
     @staticmethod
     @functools.lru_cache(maxsize=4)
     @torch.inference_mode(False)
     def build(
-        count: int, *, spacing: float, tau: float, corner: float, dtype: torch.dtype, device: torch.device
+        count: int, *, spacing: float, tau: float, round: bool, dtype: torch.dtype, device: torch.device
     ) -> Warp | None:
-        """For pupil grids (N, N), both planes alike; None where nothing moves. corner: largest rho that matters."""
+        """For pupil grids (N, N), both planes alike; None where nothing moves. round: whether the corners are dark.
+
+        Raises: ValueError for an aperture so wide that neighbours move too differently.
+        """
         nodes = grid_nodes(count, spacing=spacing)
-        x, y = nodes[None, :], nodes[:, None]
-        # along x at a true y, then along y at an image-side x: rho'^2 = rho^2 (1 + tau) / (1 + tau rho^2)
-        along_x = x * (torch.sqrt((1 + tau * y**2) / (1 + tau - tau * x**2).clamp(min=0.1)) - 1)
-        along_y = y * (torch.rsqrt((1 + tau * (1 - x**2 - y**2)).clamp(min=0.1)) - 1)
-        inside = x**2 + y**2 <= corner**2
-        limit = max(float((d.abs() * inside).max()) for d in (along_x, along_y)) / spacing
-        if limit < 1e-4:
+        at, corner2 = nodes.to(dtype), _CORNER2 if round else 2 * _CORNER2
+        first, second = (move / spacing for move in _moves(at[:, None], at**2, tau, corner2))
+        moves = torch.stack([first, second])
+        if float(moves.abs().max()) < 1e-4:
             return None
-        coefficients, reach = _series(limit)
-        terms = coefficients.shape[0]
-        slabs, starts = [], []
-        width = slab_width(_SLAB, device)
-        for first in range(0, count, width):
-            columns = torch.arange(first, min(first + width, count))
-            low, high = max(0, first - reach), min(count, int(columns[-1]) + reach + 1)
-            lag = columns[None, :] - torch.arange(low, high)[:, None]
-            inside_reach = lag.abs() <= reach
-            values = coefficients[:, (lag.clamp(-reach, reach) + reach)] * inside_reach  # (terms, band, columns)
-            slabs.append(values.permute(1, 0, 2).reshape(high - low, -1).to(device, dtype))
-            starts.append(low)
-        displacements = [
-            (d / (spacing * limit)).clamp_(-1, 1).to(device, dtype).contiguous() for d in (along_x, along_y.T)
-        ]
-        return Warp(tuple(slabs), tuple(starts), terms, (displacements[0], displacements[1]))
+        along = min(slab_width(_ALONG, device), math.ceil(_STEEPEST / tau))
+        alike = _alike(moves, nodes if round else None, along=along)
+        ends = torch.stack([torch.stack(moves[:, own, beside].aminmax()) for own, beside in alike]).double()
+        middle, half = ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2
+        series, reach = _series(middle.numpy(), half.clamp(min=1e-4).numpy())
+        if max(map(len, series)) == _MOST_TERMS:
+            raise ValueError(
+                f"rays leave maps of pixels too steeply through an aperture of f/{0.5 / math.sqrt(tau):.2g}. Use a "
+                'smaller aperture, or a round one, or propagator="fresnel", which has no such rays.'
+            )
+        tiles = []
+        for (own, beside), powers, moved in zip(alike, series, middle.tolist(), strict=True):
+            moves[:, own, beside] -= moved
+            source = slice(max(0, own.start - reach), min(count, own.stop + reach))
+            lag = torch.arange(own.start, own.stop)[:, None] - torch.arange(source.start, source.stop)
+            weights = torch.from_numpy(powers)[:, lag.clamp(-reach - 1, reach + 1) + reach + 1]
+            tiles.append(_Tile(own, beside, source, weights.flatten(0, 1).to(device, dtype)))
+        return Warp(tuple(tiles), moves.to(device))
 
     def forward(self, field: Tensor) -> Tensor:
         """(N, N) in the true plane -> (N, N) in the image-side plane."""
-        return self._along(self._along(field, self.displacements[0]).T, self.displacements[1]).T
+        return self._along(self._along(field.mT, self.moves[0]).mT, self.moves[1])
 
     def adjoint(self, grid: Tensor) -> Tensor:
         """The transpose of `forward`."""
-        return self._back(self._back(grid.T, self.displacements[1]).T, self.displacements[0])
+        return self._back(self._back(grid, self.moves[1]).mT, self.moves[0]).mT
 
-    def _along(self, field: Tensor, displacement: Tensor) -> Tensor:
-        out = torch.empty_like(displacement)
-        for slab, source, target in pieces(self.slabs, self.starts, terms=self.terms):
-            terms = (field[:, source] @ slab).view(field.shape[0], self.terms, -1)
-            result = terms[:, 0]
-            for term, polynomial in zip(terms[:, 1:].unbind(1), _chebyshev(displacement[:, target]), strict=False):
-                result.addcmul_(term, polynomial)
-            out[:, target] = result
+    def _along(self, field: Tensor, moves: Tensor) -> Tensor:
+        out = torch.zeros_like(moves)
+        for tile in self.tiles:
+            move = moves[tile.along, tile.across]
+            terms = (tile.weights @ field[tile.source, tile.across]).view(-1, *move.shape)
+            total = terms[-1]
+            for term in reversed(terms[:-1].unbind()):  # Horner's rule
+                total = torch.addcmul(term, total, move)
+            out[tile.along, tile.across] = total
         return out
 
-    def _back(self, grid: Tensor, displacement: Tensor) -> Tensor:
-        field = torch.zeros_like(displacement)
-        for slab, source, target in pieces(self.slabs, self.starts, terms=self.terms):
-            terms = slab.new_empty(grid.shape[0], self.terms, slab.shape[1] // self.terms)
-            terms[:, 0] = part = grid[:, target]
-            for term, polynomial in zip(terms[:, 1:].unbind(1), _chebyshev(displacement[:, target]), strict=False):
-                torch.mul(part, polynomial, out=term)
-            field[:, source].addmm_(terms.flatten(1), slab.T)
+    def _back(self, grid: Tensor, moves: Tensor) -> Tensor:
+        field = torch.zeros_like(moves)
+        for tile in self.tiles:
+            move = moves[tile.along, tile.across]
+            powers = grid.new_empty(tile.weights.shape[0] // len(move), *move.shape)
+            powers[0] = grid[tile.along, tile.across]
+            for before, power in itertools.pairwise(powers):
+                torch.mul(before, move, out=power)
+            field[tile.source, tile.across].addmm_(tile.weights.T, powers.flatten(0, 1))
         return field
+
+
+def _moves(at: Tensor, other2: Tensor, tau: float, corner2: float) -> Pair:
+    """How far nodes move along an axis [semi-apertures]: along x at a true y, then along y at an image-side x.
+
+    rho^2 = rho'^2 / (1 + tau - tau rho'^2), without a difference of what is nearly the same.
+    """
+    excess = tau * (1 - (at**2 + other2).clamp(max=corner2))
+    rest = excess / (1 + tau - tau * at**2).clamp(min=0.1)
+    excess = excess.clamp(min=-0.9)
+    return -at * rest / (1 + torch.sqrt(1 - rest)), -at * excess / (1 + excess + torch.sqrt(1 + excess))
+
+
+def _alike(moves: Tensor, nodes: Tensor | None, *, along: int) -> list[tuple[slice, slice]]:
+    """Nodes that move about alike, along the axis of a pass and across it; nodes: of a pupil with dark corners."""
+    count, found = moves.shape[-1], []
+    for start in range(0, count, along):
+        own, dark = slice(start, min(start + along, count)), 0
+        if nodes is not None:
+            dark = int((nodes**2 > nodes[-1] ** 2 - (nodes[own] ** 2).min()).sum()) // 2
+        level = moves[:, (own.start + own.stop) // 2, dark : count - dark].mean(0) / _WIDEST
+        ends = [dark, *(level.round().diff().nonzero().flatten() + dark + 1).tolist(), count - dark]
+        found += [(own, slice(*pair)) for pair in itertools.pairwise(ends)]
+    return found
+
+
+def _series(middle: np.ndarray, half: np.ndarray) -> tuple[list[np.ndarray], int]:
+    """Of tiles whose nodes move by middle +- half (T,) [samples], the interpolation kernel h(lag + middle + u) as a
+    series of powers of u, (terms, lags) with a 0 on either side; and the largest lag.
+    """
+    reach = math.ceil(_HALF_WIDTH + float((np.abs(middle) + half).max()))
+    nodes = np.cos(np.pi * (np.arange(_MOST_TERMS) + 0.5) / _MOST_TERMS)
+    at = (middle[:, None] + half[:, None] * nodes)[..., None] + np.arange(-reach - 1, reach + 2)
+    values = kaiser_sinc(at, half_width=_HALF_WIDTH, beta=_BETA)
+    # Chebyshev polynomials are orthogonal at these nodes: this is the least-squares fit
+    fitted = scipy.fft.dct(values, axis=1) / _MOST_TERMS
+    fitted[:, 0] /= 2
+    kept = (np.abs(fitted).max(-1) > _SMALLEST).cumsum(-1).argmax(-1) + 1
+    return [
+        _powers(terms) @ own[:terms] * wide ** -np.arange(terms)[:, None]
+        for own, terms, wide in zip(fitted, kept.tolist(), half.tolist(), strict=True)
+    ], reach
+
+
+@functools.lru_cache(maxsize=_MOST_TERMS)
+def _powers(terms: int) -> np.ndarray:
+    """Chebyshev's polynomials as powers: (power, polynomial)."""
+    rows = (chebyshev.cheb2poly(row[: order + 1]) for order, row in enumerate(np.eye(terms)))
+    return np.stack([np.pad(row, (0, terms - len(row))) for row in rows], axis=1)
 
 
 def warp_terms(count: int, tau: float) -> float:
     """About how many terms the series of a pupil of so many samples has, without building it."""
     return 3 + 7 * (0.19 * tau * count / 2) ** 0.6
-
-
-def _chebyshev(u: Tensor) -> Iterator[Tensor]:
-    """T1(u), T2(u), ... without end."""
-    before, now = torch.ones_like(u), u.clone()
-    while True:
-        yield now
-        before, now = now, (2 * u * now).sub_(before)
-
-
-def _series(limit: float) -> tuple[Tensor, int]:
-    """Chebyshev coefficients (terms, 2 reach + 1) of the interpolation kernel h(lag + u * limit), |u| <= 1."""
-    reach = int(np.ceil(_HALF_WIDTH + limit))
-    nodes = np.cos(np.pi * (np.arange(2 * _MOST_TERMS) + 0.5) / (2 * _MOST_TERMS))
-    values = kaiser_sinc(np.arange(-reach, reach + 1)[:, None] + limit * nodes, half_width=_HALF_WIDTH, beta=_BETA)
-    # Chebyshev polynomials are orthogonal at these nodes: this is the least-squares fit
-    fitted = scipy.fft.dct(values, axis=1)[:, :_MOST_TERMS].T / len(nodes)
-    fitted[0] /= 2
-    kept = np.nonzero(np.abs(fitted).max(1) > _SMALLEST)[0]
-    return torch.as_tensor(fitted[: max(int(kept[-1]) + 1, 2)]), reach
 
 
 @dataclass(frozen=True)
