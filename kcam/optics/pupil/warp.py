@@ -175,7 +175,7 @@ def _powers(terms: int) -> np.ndarray:
 
 def warp_terms(count: int, tau: float) -> float:
     """About how many terms the series of a pupil of so many samples has, without building it."""
-    return 3 + 7 * (0.19 * tau * count / 2) ** 0.6
+    return 2.4 + 1.9 * (0.19 * tau * count / 2) ** 0.6
 
 
 @dataclass(frozen=True)
