@@ -60,13 +60,23 @@ def test_edge_weights_take_little_memory() -> None:
 
 
 @pytest.mark.parametrize(("frequency", "bound"), [((0.0, 0.0), 5e-6), ((0.2, 0.1), 2e-5), ((0.38, 0.0), 1e-4)])
-@pytest.mark.parametrize("tau", [0.002, 0.05])
-def test_a_wave_is_carried_to_the_image_side(tau: float, frequency: tuple[float, float], bound: float) -> None:
+@pytest.mark.parametrize(
+    ("tau", "count", "round"),
+    [
+        (0.002, 256, True),
+        (0.05, 256, True),
+        (0.08, 600, True),
+        (0.2, 300, True),
+        (0.01, 256, False),
+        (0.13, 400, False),
+    ],
+)
+def test_a_wave_is_carried_to_the_image_side(
+    tau: float, count: int, round: bool, frequency: tuple[float, float], bound: float
+) -> None:
     """rho^2 = rho'^2 / (1 + tau - tau rho'^2): a plane wave of the true plane, evaluated there. Cycles per sample."""
-    count = 256
     spacing = grid_spacing(count)
-    like = {"dtype": torch.float64, "device": torch.device("cpu")}
-    warp = Warp.build(count, spacing=spacing, tau=tau, round=True, **like)
+    warp = Warp.build(count, spacing=spacing, tau=tau, round=round, dtype=torch.float64, device=torch.device("cpu"))
     assert warp is not None
     nodes = grid_nodes(count, spacing=spacing)
     x, y = nodes[None, :], nodes[:, None]
@@ -75,7 +85,28 @@ def test_a_wave_is_carried_to_the_image_side(tau: float, frequency: tuple[float,
         return torch.cos(2 * math.pi * (frequency[0] * x + frequency[1] * y) / spacing + 0.4)
 
     scale = torch.rsqrt(1 + tau * (1 - x**2 - y**2))
-    inside = x**2 + y**2 < 0.9  # where no tap is beyond the grid
+    inside = (x**2 + y**2 < 0.9) if round else (torch.maximum(x.abs(), y.abs()) < 0.95)  # no tap is beyond the grid
     error = float(((warp.forward(wave(x + 0 * y, y + 0 * x)) - wave(x * scale, y * scale)) * inside).abs().max())
     print(f"tau {tau}, {frequency}: {error:.1e}")
     assert error <= bound
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_way_back_is_the_transpose(seed: int) -> None:
+    """Of any wide aperture, round or square, in as many tiles as it takes: <W a, b> = <a, W^T b>."""
+    draw = torch.Generator().manual_seed(seed)
+    tau, count = (
+        10 ** float(torch.rand((), generator=draw) * 2 - 3),
+        int(torch.randint(40, 200, (), generator=draw)) * 2,
+    )
+    like = {"dtype": torch.float64, "device": torch.device("cpu")}
+    warp = Warp.build(count, spacing=grid_spacing(count), tau=tau, round=seed % 2 == 0, **like)
+    assert warp is not None
+    a, b = torch.randn(2, count, count, generator=draw, dtype=torch.float64)
+    assert float((warp.forward(a) * b).sum()) == pytest.approx(float((a * warp.adjoint(b)).sum()), rel=1e-10)
+
+
+def test_an_aperture_that_is_too_wide_says_so() -> None:
+    like = {"dtype": torch.float64, "device": torch.device("cpu")}
+    with pytest.raises(ValueError, match=r"aperture of f/0\.71\. Use a smaller aperture"):
+        Warp.build(600, spacing=grid_spacing(600), tau=0.5, round=False, **like)

@@ -25,13 +25,13 @@ from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.rim import kaiser_sinc
 
 _ALONG = 32  # nodes of a tile: narrow enough to leave out most zeros, wide enough for a matrix product
-_STEEPEST = 4.0  # tau times those, at most: what moves differ by along a tile is then about
-_WIDEST = 3.0  # samples, what they may differ by across it
-_MOST_TERMS = 28
+_WIDEST = 3.0  # samples that moves differ by along a tile, and across it, at most
+_MOST_TERMS, _MOST = 28, 5.5  # enough for moves of so many samples to either side of a tile's middle
 _HALF_WIDTH = 16  # samples; half width of the interpolating sinc
 _BETA = 10.4  # both passes: 4e-6 of a field's mean off, 6e-5 at 0.76 of the Nyquist frequency; kappa 2.5 needs 0.8
 _SMALLEST = 3e-5  # coefficient of the series that is kept
-_CORNER2 = 1.05**2  # of the radius up to which moves are right: beyond the rim is no light
+_FARTHEST, _BEYOND = 1.3, 0.03  # semi-apertures up to which moves are right, as what the rim's low-pass leaves needs
+# them where there are few nodes; beyond the rim at most, times tau
 
 
 @dataclass(frozen=True)
@@ -69,26 +69,30 @@ class Warp:
         Raises: ValueError for an aperture so wide that neighbours move too differently.
         """
         nodes = grid_nodes(count, spacing=spacing)
-        at, corner2 = nodes.to(dtype), _CORNER2 if round else 2 * _CORNER2
+        farthest = min(float(nodes[-1]), _FARTHEST, 1 + _BEYOND / max(abs(tau), 1e-9))
+        at, corner2 = nodes.to(dtype), (1 if round else 2) * farthest**2
         first, second = (move / spacing for move in _moves(at[:, None], at**2, tau, corner2))
         moves = torch.stack([first, second])
         if float(moves.abs().max()) < 1e-4:
             return None
-        along = min(slab_width(_ALONG, device), math.ceil(_STEEPEST / tau))
-        alike = _alike(moves, nodes if round else None, along=along)
+        alike = _alike(moves, nodes if round else None, width=slab_width(_ALONG, device))
         ends = torch.stack([torch.stack(moves[:, own, beside].aminmax()) for own, beside in alike]).double()
         middle, half = ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2
-        series, reach = _series(middle.numpy(), half.clamp(min=1e-4).numpy())
-        if max(map(len, series)) == _MOST_TERMS:
+        if float(half.max()) > _MOST:
             raise ValueError(
-                f"rays leave maps of pixels too steeply through an aperture of f/{0.5 / math.sqrt(tau):.2g}. Use a "
-                'smaller aperture, or a round one, or propagator="fresnel", which has no such rays.'
+                "rays leave maps of pixels too steeply through an aperture of "
+                f"f/{0.5 / math.sqrt(abs(tau)):.2g}. Use a smaller aperture, or a round one, or "
+                'propagator="fresnel", which has no such rays.'
             )
+        whole = middle.round()
+        series, reach = _series((middle - whole).numpy(), half.clamp(min=1e-4).numpy())
         tiles = []
-        for (own, beside), powers, moved in zip(alike, series, middle.tolist(), strict=True):
+        for (own, beside), powers, moved, shift in zip(alike, series, middle.tolist(), whole.tolist(), strict=True):
             moves[:, own, beside] -= moved
-            source = slice(max(0, own.start - reach), min(count, own.stop + reach))
-            lag = torch.arange(own.start, own.stop)[:, None] - torch.arange(source.start, source.stop)
+            place = own.start + int(shift), own.stop + int(shift)
+            first = min(max(0, place[0] - reach), count - 1)
+            source = slice(first, max(first + 1, min(count, place[1] + reach)))
+            lag = torch.arange(*place)[:, None] - torch.arange(first, source.stop)
             weights = torch.from_numpy(powers)[:, lag.clamp(-reach - 1, reach + 1) + reach + 1]
             tiles.append(_Tile(own, beside, source, weights.flatten(0, 1).to(device, dtype)))
         return Warp(tuple(tiles), moves.to(device))
@@ -135,16 +139,24 @@ def _moves(at: Tensor, other2: Tensor, tau: float, corner2: float) -> Pair:
     return -at * rest / (1 + torch.sqrt(1 - rest)), -at * excess / (1 + excess + torch.sqrt(1 + excess))
 
 
-def _alike(moves: Tensor, nodes: Tensor | None, *, along: int) -> list[tuple[slice, slice]]:
-    """Nodes that move about alike, along the axis of a pass and across it; nodes: of a pupil with dark corners."""
-    count, found = moves.shape[-1], []
-    for start in range(0, count, along):
-        own, dark = slice(start, min(start + along, count)), 0
-        if nodes is not None:
-            dark = int((nodes**2 > nodes[-1] ** 2 - (nodes[own] ** 2).min()).sum()) // 2
-        level = moves[:, (own.start + own.stop) // 2, dark : count - dark].mean(0) / _WIDEST
+def _alike(moves: Tensor, nodes: Tensor | None, *, width: int) -> list[tuple[slice, slice]]:
+    """Nodes that move about alike: along the axis of a pass, so many at most, and across it. nodes: of a pupil that is
+    dark in the corners.
+    """
+    count, found, start = moves.shape[-1], [], 0
+    steps = moves[..., :: max(1, count // 64)].diff(dim=1).abs().amax((0, 2)).tolist()
+    while start < count:
+        stop, apart = start + 1, 0.0
+        while stop < min(start + width, count) and (apart := apart + steps[stop - 1]) < _WIDEST:
+            stop += 1
+        own, dark = slice(start, stop), 0
+        if nodes is not None:  # the low-pass of the rim is as wide along x and y: along diagonals it reaches farther
+            farthest = 1 + math.sqrt(2) * (float(nodes[-1]) - 1)
+            dark = int((nodes**2 > farthest**2 - (nodes[own] ** 2).min()).sum()) // 2
+        level = moves[:, (start + stop) // 2, dark : count - dark].mean(0) / _WIDEST
         ends = [dark, *(level.round().diff().nonzero().flatten() + dark + 1).tolist(), count - dark]
-        found += [(own, slice(*pair)) for pair in itertools.pairwise(ends)]
+        found += [(own, slice(*pair)) for pair in itertools.pairwise(ends) if pair[0] < pair[1]]
+        start = stop
     return found
 
 
