@@ -67,7 +67,7 @@ def test_edge_weights_take_little_memory() -> None:
         (0.05, 256, True),
         (0.08, 600, True),
         (0.2, 300, True),
-        (0.01, 256, False),
+        (0.01, 64, False),
         (0.13, 400, False),
     ],
 )
@@ -85,7 +85,7 @@ def test_a_wave_is_carried_to_the_image_side(
         return torch.cos(2 * math.pi * (frequency[0] * x + frequency[1] * y) / spacing + 0.4)
 
     scale = torch.rsqrt(1 + tau * (1 - x**2 - y**2))
-    inside = (x**2 + y**2 < 0.9) if round else (torch.maximum(x.abs(), y.abs()) < 0.95)  # no tap is beyond the grid
+    inside = (x**2 + y**2 < 0.9) if round else (torch.maximum(x.abs(), y.abs()) < 0.85)  # no tap is beyond the grid
     error = float(((warp.forward(wave(x + 0 * y, y + 0 * x)) - wave(x * scale, y * scale)) * inside).abs().max())
     print(f"tau {tau}, {frequency}: {error:.1e}")
     assert error <= bound
