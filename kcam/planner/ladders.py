@@ -133,6 +133,7 @@ UNRECORDED, FARTHER = 1e-3, 1.2  # RMS of light of a wavelength, of that of all,
 LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
 MARKS = (5, 13, 33, 65)  # of these, by which the others are priced
+SEEN = 1.5  # pixels that blur differs by from one of these to the next: of coarser ones none may be near the focus
 
 
 def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:
@@ -236,16 +237,24 @@ class _View:
         return f"down to {self.imaging.illuminated(self.scene):.0%}"
 
     @property
+    def of_lights(self) -> bool:
+        """Whether what a few layers tell depends on where they are: of a few lights, and of light of few bands."""
+        pixels = self.query is None or self.query.has_pixel_phase
+        stands_out = self.evaluator.few_lights or self.evaluator.of_lines
+        return stands_out and not pixels and self.layers > FEW_LAYERS
+
+    @property
     def around_lights(self) -> tuple[float, ...]:
-        """Distances of layers that tell what wavelengths cost a few lights: the ends, what is in focus, and where the
-        brightest are.
+        """Distances of layers that tell what wavelengths cost a few lights: the ends, what is in focus, those between,
+        and where the brightest are.
         """
         far, near = (float(end) for end in self.vergences.aminmax())
         focus = sum(self.evaluator.defocus.focus) / 2
         energy = self.scene.coefficients.detach().square().sum(1).flatten().cpu()
         vergence = 1 / torch.as_tensor(self.scene.depth, dtype=torch.float64).detach().cpu()
         lights = vergence.flatten()[energy.topk(min(BRIGHTEST, len(energy))).indices]
-        places = {far, focus if far < focus < near else (far + near) / 2, near, *lights.tolist()}
+        middle = focus if far < focus < near else (far + near) / 2
+        places = {far, (far + middle) / 2, middle, (middle + near) / 2, near, *lights.tolist()}
         return tuple(1 / place if place > 0 else math.inf for place in sorted(places))
 
     def few(
@@ -327,9 +336,9 @@ def _precision(view: _View) -> Iterator[Ladder]:
 
 def _wavelengths(view: _View) -> Iterator[Ladder]:
     """Of scenes at one distance, where all are compared at no cost, those between a few; else groups."""
-    lamps = view.query is not None and view.query.symmetric and view.evaluator.few_lights
     pixels = view.query is not None and view.query.has_pixel_phase
-    beside = view.few(bands=0, layers=view.around_lights if lamps and view.layers > FEW_LAYERS else None)
+    lamps = view.of_lights
+    beside = view.few(bands=0, layers=view.around_lights if lamps else None)
     query, tabled = view.query, view.evaluator.tabled(beside)
     folded = query is not None and (query.folded() or (query.folded(GAPS) and not tabled))
     unsteady = folded or view.evaluator.missed or (view.evaluator.of_lines and not tabled)
@@ -403,7 +412,7 @@ def _depth(view: _View) -> Iterator[Ladder]:
         if view.evaluator.certain:
             layers.at_least = {0: ONE_PLANE * view.defocused / 2}
     else:
-        marks = MARKS if view.evaluator.certain else ()
+        marks = tuple(n for n in MARKS if n > view.defocused / SEEN) if view.evaluator.certain else ()
         layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
     if view.evaluator.certain and view.imaging.accuracy.occlusion:
         layers.seams = _seams(view, beside, own=own)
@@ -465,7 +474,8 @@ def _support(view: _View) -> Iterator[Ladder]:
     tabled = not by_lines and view.evaluator.tabled(view.beside)
     pixels = by_lines and view.query is not None and view.query.has_pixel_phase
     bands = 0 if missed else FEW_BANDS if by_lines else ROUND
-    beside = view.few(bands=bands, layers=view.few_layers if pixels else FEW_LAYERS, window=False)
+    layers = view.few_layers if pixels else view.around_lights if view.of_lights else FEW_LAYERS
+    beside = view.few(bands=bands, layers=layers, window=False)
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
     core = tabled and view.evaluator.few_lights  # of which little may count that is far, as beyond wrapped profiles
     least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one and not core else 0.0

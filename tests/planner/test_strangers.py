@@ -26,7 +26,7 @@ def some(*, quick: int, slow: int) -> list[Any]:
     return [*range(quick), *(pytest.param(n, marks=pytest.mark.slow) for n in range(quick, slow))]
 
 
-def check(camera: Camera, scene: Scene) -> None:
+def check(camera: Camera, scene: Scene, *, too_low: float = TOO_LOW) -> None:
     with torch.no_grad():
         planner, truth = Planner(camera, scene), noiseless_raw(camera)(scene)
         for tolerance in TOLERANCES:
@@ -34,7 +34,7 @@ def check(camera: Camera, scene: Scene) -> None:
             raw = noiseless_raw(plan.apply(camera))(scene)
             error = worst(raw, truth)
             assert error <= tolerance, f"{error / tolerance:.2f} of {tolerance} with {plan.changes}"
-            assert error < 1e-5 or plan.bound > TOO_LOW * error, f"{plan.bound / error:.2f} with {plan.changes}"
+            assert error < 1e-5 or plan.bound > too_low * error, f"{plan.bound / error:.2f} with {plan.changes}"
 
 
 def bayer() -> tuple[nn.Module, ...]:
@@ -261,6 +261,28 @@ def test_lights_at_one_of_many_distances(seed: int) -> None:
     )
     narrow = torch.linspace(540, 544, 3, dtype=torch.float64) * nm  # what colours cost there is another question
     check(Camera(imaging, *bayer()), Scene.from_bands(light, wavelengths=narrow, depth=depth))
+
+
+@pytest.mark.parametrize("seed", some(quick=3, slow=24))
+def test_light_of_a_few_bands_on_a_ramp_before_a_pupil_that_is_not_round(seed: int) -> None:
+    """A little out of focus wavelengths differ more than in focus, and than at the ends of the ramp."""
+    draw = Draw(seed)
+    size, far, near = draw.one_of(32, 40, 56), 1 / draw.number(1, 3), 1 / draw.number(0.4, 0.5)
+    wavelengths = torch.linspace(draw.number(450, 650), draw.number(750, 950), 28, dtype=torch.float64) * nm
+    light = torch.zeros(1, 28, size, size)
+    for _ in range(draw.one_of(1, 2, 4)):
+        light[:, draw.whole(0, 27), :, draw.whole(8, size - 9) :] += draw.number(0.1, 10)
+    ramp = 1 / torch.linspace(far, near, size, dtype=torch.float64)
+    depth = (ramp[:, None] if draw.one_of(True, False) else ramp).expand(1, 1, size, size).contiguous()
+    width = draw.number(3, 4.2) * mm
+    plate: tuple[nn.Module, ...] = (optics.SquareAperture(width), optics.ThinLens(8 * mm))
+    if draw.one_of(True, False):
+        waves = torch.tensor([0.0, 0.0, 0.0, 0.0, *(draw.number(-0.2, 0.2) for _ in range(3))])
+        plate = (optics.CircularAperture(width), optics.ThinLens(8 * mm), optics.ZernikeAberration(waves * 550 * nm))
+    lens = optics.Lens(*plate, focus_distance=draw.number(0.5, 0.9))
+    imaging = optics.Imaging(lens, pixel_pitch=draw.number(1.5, 3) * um, integrate=draw.one_of(True, False))
+    scene = Scene.from_bands(light, wavelengths=wavelengths, depth=depth)
+    check(Camera(imaging, sensor.Exposure()), scene, too_low=0.65)  # of a window that errs 0.002, one in 24
 
 
 @pytest.mark.parametrize("seed", some(quick=3, slow=24))
