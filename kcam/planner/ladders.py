@@ -133,7 +133,7 @@ UNRECORDED, FARTHER = 1e-3, 1.2  # RMS of light of a wavelength, of that of all,
 LAYERS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 MOST = 0.7  # of all layers: more of them save next to nothing, and where each distance has its own, miss some of these
 MARKS = (5, 13, 33, 65)  # of these, by which the others are priced
-SEEN = 1.5  # pixels that blur differs by from one of these to the next: of coarser ones none may be near the focus
+SEEN = 1.5  # pixels that blur of lights differs by from one of these to the next: of coarser ones none may be in focus
 
 
 def ladders(evaluator: Evaluator, scene: Scene, *, one: bool = False) -> list[Ladder]:
@@ -412,7 +412,9 @@ def _depth(view: _View) -> Iterator[Ladder]:
         if view.evaluator.certain:
             layers.at_least = {0: ONE_PLANE * view.defocused / 2}
     else:
-        marks = tuple(n for n in MARKS if n > view.defocused / SEEN) if view.evaluator.certain else ()
+        marks = MARKS if view.evaluator.certain else ()
+        if view.of_lights:
+            marks = tuple(mark for mark in marks if mark > view.defocused / SEEN)
         layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
     if view.evaluator.certain and view.imaging.accuracy.occlusion:
         layers.seams = _seams(view, beside, own=own)
