@@ -412,7 +412,7 @@ def _depth(view: _View) -> Iterator[Ladder]:
         if view.evaluator.certain:
             layers.at_least = {0: ONE_PLANE * view.defocused / 2}
     else:
-        marks = MARKS if view.evaluator.certain else ()
+        marks: tuple[int, ...] = MARKS if view.evaluator.certain else ()
         if view.of_lights:
             marks = tuple(mark for mark in marks if mark > view.defocused / SEEN)
         layers = Ladder("depth", [*levels, top], beside, successive=True, fastest=FASTEST, marks=marks)
