@@ -476,8 +476,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     tabled = not by_lines and view.evaluator.tabled(view.beside)
     pixels = by_lines and view.query is not None and view.query.has_pixel_phase
     bands = 0 if missed else FEW_BANDS if by_lines else ROUND
-    layers = view.few_layers if pixels else view.around_lights if view.of_lights else FEW_LAYERS
-    beside = view.few(bands=bands, layers=layers, window=False)
+    beside = view.few(bands=bands, layers=view.few_layers if pixels else FEW_LAYERS, window=False)
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
     core = tabled and view.evaluator.few_lights  # of which little may count that is far, as beyond wrapped profiles
     least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one and not core else 0.0

@@ -282,7 +282,7 @@ def test_light_of_a_few_bands_on_a_ramp_before_a_pupil_that_is_not_round(seed: i
     lens = optics.Lens(*plate, focus_distance=draw.number(0.5, 0.9))
     imaging = optics.Imaging(lens, pixel_pitch=draw.number(1.5, 3) * um, integrate=draw.one_of(True, False))
     scene = Scene.from_bands(light, wavelengths=wavelengths, depth=depth)
-    check(Camera(imaging, sensor.Exposure()), scene, too_low=0.65)  # of a window that errs 0.002, one in 24
+    check(Camera(imaging, sensor.Exposure()), scene, too_low=0.55)  # of a window that errs 0.002, one in 24
 
 
 @pytest.mark.parametrize("seed", some(quick=3, slow=24))
