@@ -95,10 +95,8 @@ def test_a_wave_is_carried_to_the_image_side(
 def test_the_way_back_is_the_transpose(seed: int) -> None:
     """Of any wide aperture, round or square, in as many tiles as it takes: <W a, b> = <a, W^T b>."""
     draw = torch.Generator().manual_seed(seed)
-    tau, count = (
-        10 ** float(torch.rand((), generator=draw) * 2 - 3),
-        int(torch.randint(40, 200, (), generator=draw)) * 2,
-    )
+    tau = 10 ** float(torch.rand((), generator=draw) * 2 - 3)
+    count = 2 * int(torch.randint(40, 200, (), generator=draw))
     like = {"dtype": torch.float64, "device": torch.device("cpu")}
     warp = Warp.build(count, spacing=grid_spacing(count), tau=tau, round=seed % 2 == 0, **like)
     assert warp is not None

@@ -12,13 +12,12 @@ _SLAB_NODES, _SLAB_PIXELS = 16, 32  # narrow enough to leave out most zeros, wid
 _WIDE = 512  # on a GPU, where a small product costs what a large one does
 
 
-def pieces(slabs: Sequence[Tensor], starts: Sequence[int], *, terms: int = 1) -> Iterator[tuple[Tensor, slice, slice]]:
-    """(slab, its inputs, its outputs) of a banded matrix in slabs of columns, of so many terms side by side."""
+def pieces(slabs: Sequence[Tensor], starts: Sequence[int]) -> Iterator[tuple[Tensor, slice, slice]]:
+    """(slab, its inputs, its outputs) of a banded matrix in slabs of columns."""
     at = 0
     for slab, start in zip(slabs, starts, strict=True):
-        columns = slab.shape[1] // terms
-        yield slab, slice(start, start + slab.shape[0]), slice(at, at + columns)
-        at += columns
+        yield slab, slice(start, start + slab.shape[0]), slice(at, at + slab.shape[1])
+        at += slab.shape[1]
 
 
 def slab_width(narrow: int, device: torch.device) -> int:

@@ -19,7 +19,7 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
-from kcam.optics.numerics import Pair, lagrange
+from kcam.optics.numerics import lagrange
 from kcam.optics.pupil.banded import slab_width
 from kcam.optics.pupil.coordinates import grid_nodes
 from kcam.optics.pupil.rim import kaiser_sinc
@@ -71,8 +71,7 @@ class Warp:
         nodes = grid_nodes(count, spacing=spacing)
         farthest = min(float(nodes[-1]), _FARTHEST, 1 + _BEYOND / max(abs(tau), 1e-9))
         at, corner2 = nodes.to(dtype), (1 if round else 2) * farthest**2
-        first, second = (move / spacing for move in _moves(at[:, None], at**2, tau, corner2))
-        moves = torch.stack([first, second])
+        moves = _moves(at[:, None], at**2, tau, corner2) / spacing
         if float(moves.abs().max()) < 1e-4:
             return None
         alike = _alike(moves, nodes if round else None, width=slab_width(_ALONG, device))
@@ -128,15 +127,16 @@ class Warp:
         return field
 
 
-def _moves(at: Tensor, other2: Tensor, tau: float, corner2: float) -> Pair:
-    """How far nodes move along an axis [semi-apertures]: along x at a true y, then along y at an image-side x.
+def _moves(at: Tensor, other2: Tensor, tau: float, corner2: float) -> Tensor:
+    """How far nodes move along an axis, (2, ...) [semi-apertures]: along x at a true y, along y at an image-side x.
 
     rho^2 = rho'^2 / (1 + tau - tau rho'^2), without a difference of what is nearly the same.
     """
     excess = tau * (1 - (at**2 + other2).clamp(max=corner2))
     rest = excess / (1 + tau - tau * at**2).clamp(min=0.1)
     excess = excess.clamp(min=-0.9)
-    return -at * rest / (1 + torch.sqrt(1 - rest)), -at * excess / (1 + excess + torch.sqrt(1 + excess))
+    first = -at * rest / (1 + torch.sqrt(1 - rest))
+    return torch.stack([first, -at * excess / (1 + excess + torch.sqrt(1 + excess))])
 
 
 def _alike(moves: Tensor, nodes: Tensor | None, *, width: int) -> list[tuple[slice, slice]]:
