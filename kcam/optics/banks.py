@@ -62,7 +62,7 @@ class KnownPSFs:
             for value, psfs in zip(layers.tolist(), compute(layers, asked, pixels), strict=True):
                 self.psfs.update({((how, value), (how, w)): psf for w, psf in zip(asked.tolist(), psfs, strict=True)})
         return torch.stack(
-            [torch.stack([_middle(self.psfs[row, column], pixels.shape) for column in columns]) for row in rows]
+            [torch.stack([middle(self.psfs[row, column], pixels.shape) for column in columns]) for row in rows]
         )
 
     def window(
@@ -96,8 +96,9 @@ class KnownPSFs:
         return known is not None and all(n >= m for n, m in zip(known.shape, shape, strict=True))
 
 
-def _middle(psf: Tensor, shape: tuple[int, int]) -> Tensor:
-    for dim, length in enumerate(shape):
+def middle(psf: Tensor, shape: tuple[int, int]) -> Tensor:
+    """The middle (..., h, w) of PSFs with a larger window, not copied."""
+    for dim, length in zip((-2, -1), shape, strict=True):
         psf = psf.narrow(dim, psf.shape[dim] // 2 - length // 2, length)
     return psf
 

@@ -104,20 +104,62 @@ class _Detail:
 
 
 @dataclass(frozen=True)
-class FieldPicture:
-    """How a picture over the field is made.
+class FieldBank:
+    """PSFs of places of a picture.
 
-    psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. renderer: of the
-    picture, whose PSFs are those of each zone. accuracy: what is computed. mixing: weights (M, L) of sums that the
-    renderer takes instead of PSFs.
+    psfs: over the sensor. pixels: of their window. centre: of the picture, x and y on the sensor [m]. accuracy: what is
+    computed. mixing: weights (M, L) of sums that stand instead, None for PSFs.
     """
 
     psfs: FieldPSFs
     pixels: PixelGrid
     centre: tuple[float, float]
-    renderer: Renderer
     accuracy: Accuracy
-    mixing: Tensor | None = None
+    mixing: Tensor | None
+
+    def bank(self, places: Tensor, *, colours: float = math.inf) -> Tensor:
+        """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
+        own = self._on_sensor(places) if self.accuracy.field_variation else torch.zeros_like(places[:1])
+        whole = self.accuracy.renormalise or self.accuracy.psf_shape is None  # light outside is put back
+        psfs = self.psfs.bank(own, self.pixels, whole=whole, mixing=self.mixing, colours=colours)
+        psfs = psfs / self.psfs.illumination(own).to(psfs).view(-1, 1, 1, 1, 1)
+        return psfs.expand(len(places), *psfs.shape[1:])
+
+    def off_between_nodes(self, place: tuple[float, float], picture: tuple[int, int]) -> Tensor:
+        """What PSFs (Z, G, h, w) are off by in a picture (H, W) that shares light out among nodes as far apart as
+        `Accuracy(spacing=)` says: at a place, or in the middle of its cell, where that is more.
+        """
+        apart, own = self.accuracy.node_spacing or math.inf, torch.tensor(place, dtype=torch.float64)
+        sides = zip(place, picture[::-1], self.pixels.shape[::-1], strict=True)
+        cell = torch.stack([_around(Axis.of(n, m, apart=apart).nodes, at) for at, n, m in sides])
+        x, y = ((own - cell[:, 0]) / (cell[:, 1] - cell[:, 0]).clamp(min=1e-9)).clamp(0, 1).tolist()
+        corners = self.bank(torch.cartesian_prod(*cell))
+        there, middle = self.bank(torch.stack([own, cell.mean(1)]))
+        shares = corners.new_tensor([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y])
+        off = torch.stack([torch.tensordot(shares, corners, dims=1) - there, corners.mean(0) - middle])
+        return off[off.square().flatten(1).sum(1).argmax()]
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether places that mirror each other have PSFs that do."""
+        return self.psfs.mirrored and not any(self.centre) and all(m % 2 for m in self.pixels.shape)
+
+    @property
+    def _centre(self) -> Tensor:
+        return torch.tensor(self.centre, dtype=torch.float64)
+
+    def _on_sensor(self, places: Tensor) -> Tensor:
+        return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
+
+
+@dataclass(frozen=True)
+class FieldPicture(FieldBank):
+    """How a picture over the field is made.
+
+    renderer: of the picture, whose PSFs are those of each zone; mixing: of sums that it takes instead of PSFs.
+    """
+
+    renderer: Renderer
 
     def light(self, planes: Tensor, shares: Tensor | None) -> Tensor:
         """(B, C, H, W) of planes (B, K, H, W) and shares of layers (B, Z, H, W), None for one."""
@@ -135,7 +177,7 @@ class FieldPicture:
             nodes=(rows, columns),
             window=window,
             border=self.renderer.border,
-            mirrored=self._mirrored,
+            mirrored=self.mirrored,
         )
 
     def render(
@@ -168,14 +210,6 @@ class FieldPicture:
 
         return resampling(ideal, picture, self.renderer.border)
 
-    def bank(self, places: Tensor, *, colours: float = math.inf) -> Tensor:
-        """PSFs (N, Z, G, h, w) of places (N, 2) of the upright picture, in pixels from its middle."""
-        own = self._on_sensor(places) if self.accuracy.field_variation else torch.zeros_like(places[:1])
-        whole = self.accuracy.renormalise or self.accuracy.psf_shape is None  # light outside is put back
-        psfs = self.psfs.bank(own, self.pixels, whole=whole, mixing=self.mixing, colours=colours)
-        psfs = psfs / self.psfs.illumination(own).to(psfs).view(-1, 1, 1, 1, 1)
-        return psfs.expand(len(places), *psfs.shape[1:])
-
     def explain(self, planes: Tensor, shares: Tensor | None) -> FieldEstimate:
         """What `light` will do, and what it is off by."""
         with torch.no_grad():
@@ -195,13 +229,6 @@ class FieldPicture:
             deviations = self.psfs.deviations(self.pixels, colours=how.colours)
             return FieldEstimate((rows, columns), int(apart), blending, how.between, colours=how.coloured, **deviations)
 
-    @property
-    def _centre(self) -> Tensor:
-        return torch.tensor(self.centre, dtype=torch.float64)
-
-    def _on_sensor(self, places: Tensor) -> Tensor:
-        return self._centre - places * self.pixels.pitch  # the picture is upright, light falls turned about
-
     def _of(self, colours: float) -> Bank:
         """The bank of so many wavelengths. Where gradients are asked for, it is computed again on the way back, a few
         PSFs at a time.
@@ -219,7 +246,7 @@ class FieldPicture:
     def how(self, planes: Tensor, shares: Tensor | None) -> _How:
         """How densely PSFs are computed, and nodes lie, for `ALLOWED`: planes as they were moved."""
         sides = (planes.shape[-2], planes.shape[-1])
-        probe = _probe(sides)
+        probe = probe_of(sides)
         fewest = self.psfs.fewer_colours[:1] or (math.inf,)
         detail = self._detail(planes, shares, self._of(fewest[0]))
         colours, coloured = self._colours(detail, sides)
@@ -230,10 +257,10 @@ class FieldPicture:
         bank, rest = self._of(colours), ALLOWED**2 - coloured**2
         places, most = 2.0 * probe, BETWEEN * ALLOWED
         while True:
-            known = Between.known(bank, sides, apart=places, mirrored=self._mirrored)
+            known = Between.known(bank, sides, apart=places, mirrored=self.mirrored)
             off = self._left(detail, self._interpolated(bank, known, sides))
             error = SHARED * self._left(detail, self._blended(known, sides, probe))
-            apart, error = _apart(error, probe, allowed=math.sqrt(rest - min(off, most) ** 2))
+            apart, error = nodes_apart(error, probe, allowed=math.sqrt(rest - min(off, most) ** 2))
             if off <= most:
                 return replace(how, apart=apart, blending=error, known=known, between=off)
             closer = 0.9 * (most / off) ** 0.25  # of fourth order, with something to spare
@@ -241,17 +268,12 @@ class FieldPicture:
                 break
             places *= closer
         error = self._left(detail, self._blended(bank, sides, probe))
-        apart, better = _apart(SHARED * error, probe, allowed=math.sqrt(rest))
+        apart, better = nodes_apart(SHARED * error, probe, allowed=math.sqrt(rest))
         if known.psfs.nbytes * (places / apart) ** 2 < most_held:
-            known = Between.known(bank, sides, apart=apart, mirrored=self._mirrored)
+            known = Between.known(bank, sides, apart=apart, mirrored=self.mirrored)
             return replace(how, apart=apart, blending=better, known=known)
-        apart, error = _apart(error, probe, allowed=math.sqrt(rest))
+        apart, error = nodes_apart(error, probe, allowed=math.sqrt(rest))
         return replace(how, apart=apart, blending=error)
-
-    @property
-    def _mirrored(self) -> bool:
-        """Whether nodes that mirror each other have PSFs that do."""
-        return self.psfs.mirrored and not any(self.centre) and all(m % 2 for m in self.pixels.shape)
 
     def _colours(self, detail: _Detail, sides: tuple[int, int]) -> tuple[float, float]:
         """At how many wavelengths PSFs are computed, and what this leaves."""
@@ -324,16 +346,22 @@ class FieldPicture:
         return math.sqrt(worst * detail.weight / max(detail.light, 1e-300) + uneven**2)
 
 
-def _probe(sides: tuple[int, int]) -> int:
+def probe_of(sides: tuple[int, int]) -> int:
     """Pixels between places that are tried."""
     return max(2, min(PROBE, max(sides) // 2))
+
+
+def _around(nodes: Tensor, at: float) -> Tensor:
+    """The nodes (2,) on either side of a place; one node stands for both."""
+    above = min(max(1, int((nodes < at).sum())), len(nodes) - 1)
+    return nodes[[max(0, above - 1), above]]
 
 
 def _last(sides: tuple[int, int]) -> Tensor:
     return torch.tensor([sides[1] - 1, sides[0] - 1], dtype=torch.float64) / 2
 
 
-def _apart(error: float, probe: float, *, allowed: float = ALLOWED) -> tuple[int, float]:
+def nodes_apart(error: float, probe: float, *, allowed: float = ALLOWED) -> tuple[int, float]:
     """How many pixels nodes may lie apart, and the error that this leaves, from that of nodes `probe` apart."""
     eighths = range(round(8 * math.log2(_FINEST)), round(8 * math.log2(_COARSEST)) + 1)
     steps = [round(2 ** (k / 8)) for k in eighths]

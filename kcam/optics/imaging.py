@@ -22,7 +22,7 @@ from kcam.effects import Work
 from kcam.inputs import as_values, check_bands, describe
 from kcam.optics.accuracy import OVER_THE_FIELD, Accuracy, Recipe, Shortcuts
 from kcam.optics.banks import KnownPSFs
-from kcam.optics.field import FieldEstimate, FieldPicture
+from kcam.optics.field import FieldBank, FieldEstimate, FieldPicture
 from kcam.optics.lens import Lens
 from kcam.optics.propagation.row import Propagator
 from kcam.optics.regions import zones
@@ -583,7 +583,23 @@ class Imaging(Stage):
         fewer = renderer.channels * renderer.planes < renderer.groups
         if fewer and len(vergences) == 1:  # of layers the PSFs themselves tell what they hide
             renderer, mixing = renderer.of_sums(), renderer.mixing().flatten(0, 1)
-        return FieldPicture(psfs, self.pixels(window, like), self._middle, renderer, self.accuracy, mixing)
+        return FieldPicture(psfs, self.pixels(window, like), self._middle, self.accuracy, mixing, renderer)
+
+    def field_bank(
+        self, picture: tuple[int, int], pixels: PixelGrid, *, vergences: Tensor, wavelengths: Tensor, at: Tensor
+    ) -> FieldBank:
+        """PSFs of places of a picture (H, W), of layers (Z,) [1/m], `at` some wavelengths (G,) in the range of the
+        scene's (L,) [m].
+        """
+        traced = self._traced(picture, vergences, wavelengths)
+        psfs = traced.at_wavelengths(at, lateral_colour=self.accuracy.lateral_colour)
+        return FieldBank(psfs, pixels, self._middle, self.accuracy, None)
+
+    def moved(self, scene: Scene, planes: Tensor) -> Tensor:
+        """Planes (B, J, H, W) over a scene, as distortion and relative illumination bring them to the picture."""
+        vergences, _ = self.filled(scene)
+        field = self._field_picture(scene, vergences=vergences, weights=None, like=planes)
+        return field.moved(planes, None)[0]
 
     @no_more_than_free()
     def explain(self, scene: Scene, *, colour_filter: Absorber | None = None) -> FieldEstimate:

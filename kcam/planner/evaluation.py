@@ -22,10 +22,13 @@ from torch import Tensor
 from kcam.camera import Camera
 from kcam.context import Context
 from kcam.effects import Skippable
-from kcam.optics import Imaging, Lens
+from kcam.optics import CompoundLens, Imaging, Lens
+from kcam.optics.field import ALLOWED
+from kcam.optics.imaging import is_deep
 from kcam.optics.rendering.place import Place
 from kcam.optics.source import Defocus
 from kcam.planner.light import linear
+from kcam.planner.over_field import TOLD, OverField
 from kcam.planner.plan import ENDS, Shortcuts, noiseless_raw, relative_rms, shortened, with_imaging
 from kcam.planner.samples import Sample, samples_of
 from kcam.planner.spectra import LINEAR, Care, Spectra
@@ -93,6 +96,18 @@ class Evaluator:
         return self._laid_out[key]
 
     @functools.cached_property
+    def over_field(self) -> list[OverField] | None:
+        """What spectra tell of each sample, where optics vary over the picture as those of kcam do and nothing hides
+        anything.
+        """
+        imaging, deep = self.imaging, any(is_deep(scene) for scene in self.scenes)
+        if imaging is None or not isinstance(imaging.lens, (Lens, CompoundLens)) or not self.varies:
+            return None
+        if self.gradients or deep or not linear(self.raw_camera):
+            return None
+        return [OverField(self.raw_camera, imaging, sample) for sample in self.samples]
+
+    @functools.cached_property
     def surveys(self) -> list[list[Survey]]:
         """Of each scene, what was seen of its items."""
         return [survey(scene, self.raw_camera, self.defocus) for scene in self.scenes]
@@ -136,16 +151,20 @@ class Evaluator:
             narrow = [window for one in self.spectra if (window := one.narrow(few, LOOKED))]
             if narrow and len(narrow) == len(self.spectra):
                 few |= {"psf_shape": max(narrow), "renormalise": True}
+        if self.over_field and self.imaging is not None and self._sharply(self.imaging, self.over_field, settings):
+            return
         self.signals = self._signals(few | {"precision": "float32"})  # which holds what is bright
         self.lost = self._cut_off()
-        if self.spectra and not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
+        if max(self.lost.values(), default=1.0) > CUT:
+            self.over_field = None  # what is cut off differs from place to place
+        if self._told and not self._compare({name: value for name, value in few.items() if name != "occlusion"}):
             self.spectra = None
 
-    def _sharply(self, imaging: Imaging, told: Sequence[Spectra], settings: Mapping[str, Any]) -> bool:
+    def _sharply(self, imaging: Imaging, told: Sequence[Spectra | OverField], settings: Mapping[str, Any]) -> bool:
         """See the same without blur, where that tells as much: of light of which nothing is cut off, as of a few lights
         that stand out, and not more where pixels see little of its colour.
         """
-        known = isinstance(imaging.lens, Lens)  # whose PSFs brighten nothing
+        known = isinstance(imaging.lens, (Lens, CompoundLens))  # whose PSFs brighten nothing
         if not known or self.few_lights:
             return False
         self.signals = self._signals(sharp := {**settings, "blur": False})
@@ -155,7 +174,7 @@ class Evaluator:
         self._compare(sharp)
         if max(spectra.unlike for spectra in told) > UNLIKE:
             return False
-        if imaging.border != "reflect" and not all(spectra.frame(settings) for spectra in told):
+        if imaging.border != "reflect" and not all(one.frame(settings) for one in told):
             return False
         self.dimmed = [row for spectra in told for row in spectra.dimmed(settings)]
         return True
@@ -173,7 +192,7 @@ class Evaluator:
         energies = torch.stack([given[behind][0].double().square().sum().cpu() for given in self.signals])
         rows = energies.split([len(sample.owners) for sample in self.samples])
         cut = ([self.lost[owner] > CUT for owner in sample.owners] for sample in self.samples)
-        parts = zip(self.spectra or (), rows, cut, strict=True)
+        parts = zip(self._told, rows, cut, strict=True)
         return all(spectra.compare(settings, own, cut=torch.tensor(lost)) for spectra, own, lost in parts)
 
     def _hideable(self, sample: Sample) -> Tensor:
@@ -205,12 +224,23 @@ class Evaluator:
     @property
     def certain(self) -> bool:
         """Whether what choices cost is known without trying all of them together."""
-        return self.spectra is not None
+        return self.spectra is not None or self.over_field is not None
+
+    def foretells(self, allowed: float) -> bool:
+        """Whether what choices cost is known so well that no last trial is needed: over the field not of a few lights,
+        nor near what the reference itself may be off by.
+        """
+        return self.certain and (self.over_field is None or (allowed >= 2 * ALLOWED and not self.few_lights))
+
+    @property
+    def _told(self) -> Sequence[Spectra | OverField]:
+        """What tells of each sample without trials."""
+        return self.spectra or self.over_field or ()
 
     @property
     def few_lights(self) -> bool:
         """Whether a few lights stand out in some item, where that is known."""
-        return any(bool(spectra.few_lights.any()) for spectra in self.spectra or ())
+        return any(bool(spectra.few_lights.any()) for spectra in self._told)
 
     @property
     def of_lines(self) -> bool:
@@ -240,17 +270,18 @@ class Evaluator:
 
         By spectra light beyond the full well counts too, so that they say at least as much.
         """
-        if self.spectra is None or not (changes.keys() | against.keys()) <= LINEAR:
+        told = LINEAR if self.over_field is None else TOLD
+        if not self.certain or not (changes.keys() | against.keys()) <= told:
             tried = _error(self.samples, self.answers(changes), self.answers(against))
             if not (changes.get("blur") is False is against.get("blur") and self.certain):
                 return tried
             rank = changes.get("rank")
             unseen = self._dispersion * self._left_out_by_rank(rank) if rank is not None else 0.0
             return self._dimming * max(self.lost.values(), default=1.0) * math.hypot(tried, unseen)
-        if changes.get("occlusion") != against.get("occlusion"):
+        if self.spectra and changes.get("occlusion") != against.get("occlusion"):
             return self.hiding(changes, against)
         found = [0.0]
-        for sample, spectra in zip(self.samples, self.spectra, strict=True):
+        for sample, spectra in zip(self.samples, self._told, strict=True):
             found += self._relative(sample, torch.stack(spectra.energies(changes, against, care)))
         return max(found)
 
@@ -259,7 +290,7 @@ class Evaluator:
         long as light of all bands is blurred alike.
         """
         found = [0.0]
-        for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
+        for sample, spectra in zip(self.samples, self._told, strict=True):
             bands = sample.scene.bands()
             off = (sample.low_rank(rank).bands() - bands).square().sum((2, 3)).double().cpu()
             weights = torch.eye(bands.shape[1]) if spectra.weights is None else spectra.weights
@@ -270,18 +301,19 @@ class Evaluator:
         return max(found)
 
     @property
-    def _told(self) -> dict[str, Any]:
+    def _seen_with(self) -> dict[str, Any]:
         """Of the settings with which the light was looked at, those that spectra tell."""
-        return {name: value for name, value in self._looked.items() if name in LINEAR - {"kappa"}}
+        told = LINEAR - {"kappa"} if self.over_field is None else TOLD
+        return {name: value for name, value in self._looked.items() if name in told}
 
     @functools.cached_property
     def _dispersion(self) -> float:
         """How far apart PSFs of the wavelengths are, relative to the contrast of what is seen, at most 1: of all, but
         where that takes their PSFs.
         """
-        told = dict(self._told) if self.missed else {k: v for k, v in self._told.items() if k != "bands"}
+        told = dict(self._seen_with) if self.missed else {k: v for k, v in self._seen_with.items() if k != "bands"}
         found = [0.0]
-        for spectra in self.spectra or ():
+        for spectra in self._told:
             off, all_of_it = spectra.energies({**told, "bands": 1}, told)
             found += (off / (all_of_it * spectra.contrast).clamp(min=1e-300)).sqrt().tolist()
         return min(1.0, max(found))
@@ -293,11 +325,11 @@ class Evaluator:
         """
         if self.dimmed:
             return max(self.dimmed)
-        return max((row for spectra in self.spectra or () for row in spectra.dimmed(self._told)), default=1.0)
+        return max((row for spectra in self._told for row in spectra.dimmed(self._seen_with)), default=1.0)
 
     def error_of(self, off: float) -> float:
         """The error of transfer functions that are off by so much of all light at most, at any frequency."""
-        unlike = max((spectra.unlike for spectra in self.spectra or ()), default=1.0)
+        unlike = max((spectra.unlike for spectra in self._told), default=1.0)
         return off * self._dimming * math.sqrt(unlike) * max(self.lost.values(), default=1.0)
 
     @functools.cached_property
@@ -352,6 +384,8 @@ class Evaluator:
         """
         if self.imaging is None or not self.varies:
             return {}
+        if self.over_field is not None:
+            return {"spacing": min(told.apart for told in self.over_field)}
         colours: Any = self.camera.resolve().colour_filter
         return {"spacing": min(self.imaging.apart(scene, colour_filter=colours) for scene in self.scenes)}
 

@@ -188,7 +188,8 @@ class _View:
         self.least_layers = 1 + math.ceil(self.defocused / (BLUR_APART * max(1, min(scene.shape[1:]))))
         self.evaluator = evaluator
         self.apart = evaluator.apart if evaluator.varies else None
-        self.largest = CROP if any(sample.places for sample in evaluator.samples) else max(scene.shape[1:])
+        cropped = evaluator.over_field is None and any(sample.places for sample in evaluator.samples)
+        self.largest = CROP if cropped else max(scene.shape[1:])
         self.trained = any(p.requires_grad for p in imaging.parameters())
         self.computed = isinstance(lens, Lens) or imaging.varies  # else PSFs cost next to nothing
         self.beside = self.few()
@@ -344,9 +345,10 @@ def _wavelengths(view: _View) -> Iterator[Ladder]:
     unsteady = folded or view.evaluator.missed or (view.evaluator.of_lines and not tabled)
     if unsteady and view.one:
         return  # it takes all PSFs to know: what few cost falls in no order with their number
-    successive = view.computed and not (unsteady or tabled)
+    over_field = view.evaluator.over_field is not None  # where each of few groups is compared with all
+    successive = view.computed and not (unsteady or tabled or over_field)
     deep = any(is_deep(scene) for scene in view.evaluator.scenes)
-    if successive or deep:
+    if successive or deep or view.imaging.varies:
         few: list[dict[str, Any]] = [{"bands": n} for n in group_counts(view.bands)]
     else:
         few = [interpolated(n) for n in node_counts(view.bands)]
@@ -475,20 +477,23 @@ def _support(view: _View) -> Iterator[Ladder]:
     by_lines = view.evaluator.by_lines(view.beside)
     tabled = not by_lines and view.evaluator.tabled(view.beside)
     pixels = by_lines and view.query is not None and view.query.has_pixel_phase
-    bands = 0 if missed else FEW_BANDS if by_lines else ROUND
+    over_field = view.evaluator.over_field is not None
+    bands = 0 if missed or over_field else FEW_BANDS if by_lines else ROUND  # over the field all are known
     beside = view.few(bands=bands, layers=view.few_layers if pixels else FEW_LAYERS, window=False)
     largest, unseen = max(view.window), view.unseen(beside.get("bands", view.bands))
     core = tabled and view.evaluator.few_lights  # of which little may count that is far, as beyond wrapped profiles
     least = float(view.evaluator.defocus.radius(view.vergences).max()) if view.one and not core else 0.0
     sides = [side for side in WINDOWS if max(2 * unseen, least) < side < largest]
-    levels = [level(side, renormalise=False) for side in sides]
+    levels = [level(side, renormalise=over_field) for side in sides]  # others lose what is put back
     top = Level(f"{view.window[0]} x {view.window[1]} px", {}, largest)
 
     def rescaled(plain: Level) -> list[Level]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
     levels = [*levels, top]
-    alternatives = None if pixels else rescaled  # which line spreads told to cost 0.3 to 1.2 times what they do
+    alternatives = (
+        None if pixels or over_field else rescaled
+    )  # which line spreads told to cost 0.3 to 1.2 times what they do
     ladder = Ladder("PSF support", levels, beside, alternatives=alternatives, from_top=view.evaluator.certain)
     ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
     if pixels:
@@ -502,7 +507,7 @@ def _field(view: _View) -> Iterator[Ladder]:
     """Of optics that vary over the picture."""
     if view.apart is None:
         return
-    imaging, beside = view.imaging, view.few()
+    imaging, beside = view.imaging, view.few(bands=FEW_BANDS if view.evaluator.over_field is None else ROUND)
     beside.pop("spacing", None)
     counts: dict[tuple[int, int], int] = {}
     spacing = view.largest

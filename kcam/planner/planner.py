@@ -131,7 +131,9 @@ class Planner:
     def pays(self) -> bool:
         """Whether a plan for a single picture takes less time than it saves: see `shoot`."""
         scene, imaging = self.prices.scene, self.evaluator.imaging
-        if imaging is None or self.evaluator.varies or not scene.coefficients.numel():
+        if imaging is None or not scene.coefficients.numel():
+            return False
+        if self.evaluator.varies and self.evaluator.over_field is None:
             return False
         worth = WORTH_DEEP if is_deep(scene) else WORTH
         if bool((lights(scene.coefficients.detach().sum(1, keepdim=True)) < FEW).any()):
@@ -204,7 +206,7 @@ class Planner:
         does; gives the error that it found.
         """
         counted = [skip for skip in skips if skip.counted]
-        if self.evaluator.certain:
+        if self.evaluator.foretells(allowed):
             self._foretell(steps, counted, allowed / UNTRIED)
             return None
         while True:

@@ -191,9 +191,10 @@ class Transfers:
         if not set(groups.tolist()) <= set(nodes.tolist()):
             between = _cubics(nodes, groups)
             groups, shares = nodes, between if shares is None else shares.to(between) @ between
-        return self._slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
+        return self.slices(imaging, vergences, groups, way, grey=len(wavelengths) <= len(self.few)), shares
 
-    def _slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
+    def slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
+        """Along x and y, or both diagonals, at wavelengths (G,), (Z, G or 1, 2, F); grey: which are few."""
         if not imaging.accuracy.blur:
             return torch.ones(len(vergences), 1, 2, len(self.frequencies), dtype=torch.float64)
         window = self.window(imaging, vergences)
@@ -224,7 +225,10 @@ class Transfers:
         parts = vergences.split(max(1, int(_HELD // each)))
         if len(parts) > 1:
             return torch.cat([self._of_psfs(imaging, part, wavelengths, window) for part in parts])
-        bank = imaging.bank(Points(vergences), wavelengths, pixels)
+        return self.slices_of(imaging.bank(Points(vergences), wavelengths, pixels))
+
+    def slices_of(self, bank: Tensor) -> Tensor:
+        """Of PSFs (Z, G, h, w), (Z, G, 2, F)."""
         if self.turned:
             return _along_diagonals(bank, self.frequencies)
         along, across = along_axis(self.frequencies)

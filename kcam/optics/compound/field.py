@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from kcam.optics.banks import Banks, window_side
 from kcam.optics.compound.distortion import Even, ImageHeights, chebyshev_radii
-from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, axis_light, images
+from kcam.optics.compound.images import CLOSE, QUICK, QUICK_ERROR, Closeness, Frame, areas, images, light
 from kcam.optics.compound.pupil import PupilFit
 from kcam.optics.compound.table import PupilTable
 from kcam.optics.source import PixelGrid
@@ -29,17 +29,20 @@ def bank(
     *,
     how: Closeness = CLOSE,
     whole: bool = False,
+    unit: Tensor | None = None,
 ) -> Tensor:
     """PSFs (F, Z, L, h, w) of F places, moved (F, Z, L) [m] along their directions (F, 2) on the sensor.
 
-    fitted: of F + 1 x Z x L pupils; those on the axis come last, and their light counts as 1.
+    fitted: of F + 1 x Z x L pupils; those on the axis come last, and their light counts as 1. unit: that light, (Z, L),
+    if it is known.
     """
     places, vergences, count = moved.shape
     towards = directions.repeat_interleave(vergences, dim=0)
     of_place, axis = torch.arange(len(fitted.centre)).view(-1, count).split([places * vergences, vergences])
-    light = axis_light(fitted, axis, wavelengths).repeat(places, 1)
+    unit = (light(fitted, axis, wavelengths) if unit is None else unit).repeat(places, 1)
+    energy = light(fitted, of_place, wavelengths) if whole else None
     offsets = moved.view(-1, count, 1) * towards[:, None]
-    found = images(fitted, of_place, towards, wavelengths, offsets, pixels, relative_to=light, how=how, whole=whole)
+    found = images(fitted, of_place, towards, wavelengths, offsets, pixels, relative_to=unit, how=how, whole=energy)
     return found.view(places, vergences, count, *pixels.shape)
 
 
@@ -53,10 +56,24 @@ class FieldPSFs:
     wavelengths: Tensor
     reach: float  # of places, from the axis [m]
     lateral_colour: bool = True
+    middle: Tensor | None = None  # wavelength whose light illuminates [m], () of those that were traced
+    illuminates: Even | None = None  # which takes as long to know as a PSF
+    windows: dict[float, tuple[int, int]] = field(default_factory=dict, repr=False)  # by pitch
+    units: dict[tuple[float, ...], Tensor] = field(
+        default_factory=dict, repr=False
+    )  # without gradients, by wavelengths
 
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
-        """Of others (L,) [m] in the same range; see `source.FieldPSFs`."""
-        return replace(self, wavelengths=wavelengths.to("cpu", torch.float64), lateral_colour=lateral_colour)
+        """Of others (L,) [m] in the same range; see `source.FieldPSFs`. They illuminate alike."""
+        known = None if torch.is_grad_enabled() else self._illumination
+        own = wavelengths.to("cpu", torch.float64)
+        return replace(
+            self, wavelengths=own, lateral_colour=lateral_colour, middle=self._middle, illuminates=known, windows={}
+        )
+
+    @property
+    def _middle(self) -> Tensor:
+        return self.wavelengths[len(self.wavelengths) // 2] if self.middle is None else self.middle
 
     def _fitted(self, radii: Tensor, wavelengths: Tensor) -> PupilFit:
         """Pupils of places at radii (F,) from the axis, and on it: F + 1 x Z x L."""
@@ -107,7 +124,17 @@ class FieldPSFs:
             middle = self._fitted(radii, (self.wavelengths.min() + self.wavelengths.max())[None] / 2).chief
             chief = middle.view(len(places) + 1, len(self.vergences), 1)[:-1].expand_as(chief)
         moved = chief + radii[:, None, None]
-        return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole)
+        unit = None if torch.is_grad_enabled() else self._on_axis(wavelengths)
+        return bank(fitted, wavelengths, -towards, moved, pixels, how=QUICK, whole=whole, unit=unit)
+
+    def _on_axis(self, wavelengths: Tensor) -> Tensor:
+        """Light of points on the axis, (Z, L), kept."""
+        key = (*wavelengths.tolist(),)
+        if key not in self.units:
+            fitted = self._fitted(wavelengths[:0], wavelengths)
+            nodes = torch.arange(len(fitted.centre)).view(-1, len(wavelengths))
+            self.units[key] = light(fitted, nodes, wavelengths)
+        return self.units[key]
 
     @torch.no_grad()
     def deviations(self, pixels: PixelGrid, *, colours: float = math.inf) -> dict[str, float]:
@@ -117,8 +144,8 @@ class FieldPSFs:
         radii = places.norm(dim=1)
         fitted = self._fitted(radii, self.wavelengths)
         frame = Frame.upright(fitted)
-        light = areas(fitted, frame).view(3, len(self.vergences), -1)
-        lost = 1 - psfs.sum((-2, -1)).double() / (light[:2] / light[2:])
+        all_of_it = areas(fitted, frame).view(3, len(self.vergences), -1)
+        lost = 1 - psfs.sum((-2, -1)).double() / (all_of_it[:2] / all_of_it[2:])
         pupils = self.table.deviation + 2 * math.pi * float(
             (fitted.residual.view(-1, len(self.wavelengths)) / self.wavelengths).max()
         )
@@ -141,13 +168,15 @@ class FieldPSFs:
 
     @functools.cached_property
     def _illumination(self) -> Even:
+        if self.illuminates is not None:
+            return self.illuminates
         reach = max(self.reach, 1e-9)
         radii = chebyshev_radii(reach)
         heights = self._heights(radii)
-        middle = (part[len(part) // 2].expand(len(heights)) for part in (self.vergences, self.wavelengths))
-        fitted = self.table.at(heights, *middle)
-        light = areas(fitted, Frame.upright(fitted))
-        return Even.through(light[:-1] / light[-1], radii, reach=reach)
+        middle = self.vergences[len(self.vergences) // 2], self._middle
+        fitted = self.table.at(heights, *(one.expand(len(heights)) for one in middle))
+        passed = areas(fitted, Frame.upright(fitted))
+        return Even.through(passed[:-1] / passed[-1], radii, reach=reach)
 
     @torch.no_grad()
     def blur(self) -> float:
@@ -170,6 +199,11 @@ class FieldPSFs:
         A rim of length P around an area A sends the share lambda d P / (2 pi^2 A r) beyond a radius r, see
         `Lens.window`; of each ray that falls x from the middle, what lies beyond r - x.
         """
+        if pixels.pitch not in self.windows:
+            self.windows[pixels.pitch] = self._window(pixels)
+        return self.windows[pixels.pitch]
+
+    def _window(self, pixels: PixelGrid) -> tuple[int, int]:
         slopes, area = self._spread
         colours = self._looked.repeat(len(slopes) // len(self._looked))
         # the rim of an area is that of a disc at least: 2 sqrt(pi area)

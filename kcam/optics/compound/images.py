@@ -31,7 +31,7 @@ _LOOK = 41  # points across a pupil, to see what of it is open
 _ALIKE = 1.2  # wavelengths that differ by no more than this factor share the grid of their pupils
 _EDGES = 3  # of these, at which the edges of a pupil are looked at
 _ROOM = 12  # samples of a grid beyond what is open, for the low-pass of its edge
-_ACROSS = 52  # samples across what is open, at least: its edge is spread over twelve
+_ACROSS = 96  # samples across what is open, at least: its edge is spread over twelve, and 64 are off by 0.5 %
 _AREA_SAMPLES = 128
 _NEARLY = 0.1  # of a clearance: what it is nowhere below takes no light away, also between the points where it is known
 _AT_ONCE = 2**20  # points of pupils, or of images, that are held together
@@ -171,8 +171,8 @@ def areas(fitted: PupilFit, frame: Frame, nodes: Tensor | None = None) -> Tensor
     return torch.cat(found)
 
 
-def axis_light(fitted: PupilFit, nodes: Tensor, wavelengths: Tensor) -> Tensor:
-    """Areas of the open pupils with indices in nodes (R, L), of points on the axis."""
+def light(fitted: PupilFit, nodes: Tensor, wavelengths: Tensor) -> Tensor:
+    """Areas of the open pupils with indices in nodes, (R, L)."""
     colours, weights = _seen_at(wavelengths)
     nodes = nodes[:, colours]
     upright = fitted.centre.new_tensor([[0.0, 1.0]]).expand(nodes.numel(), 2)
@@ -211,11 +211,11 @@ def images(
     *,
     relative_to: Tensor,
     how: Closeness = CLOSE,
-    whole: bool = False,
+    whole: Tensor | None = None,
 ) -> Tensor:
     """PSFs (R, L, h, w) of R points at wavelengths (L,), whose pupils have the indices `nodes` (R, L), turned towards
-    directions (R, 2), each moved by (R, L, 2) [m]; 1 is the light of an area in direction cosines, (R, L). whole: what
-    leaves the window is put back into it.
+    directions (R, 2), each moved by (R, L, 2) [m]; 1 is the light of an area in direction cosines, (R, L). whole: areas
+    of these pupils, (R, L), where what leaves the window is put back into it: coarse grids know them to 1 %.
 
     The field at points p / q apart is one FFT of length F: of a pupil sampled at lambda q / (p F). Its rows that are
     dark, and columns that nobody asks for, are left out. Pupils of similar wavelengths are sampled alike, so that
@@ -234,7 +234,7 @@ def images(
                 pixels,
                 relative_to=relative_to[:, own],
                 how=how,
-                whole=whole,
+                whole=None if whole is None else whole[:, own],
             )
             for own in groups
         ]
@@ -267,9 +267,9 @@ def images(
             count = min(length, 2 * math.ceil(float(own.half.max()) / spacing) + _ROOM)
             known = _known(fitted, nodes[part], own, spacing * (count / 2), offsets[part])
             # from here on each of the PSF's points is computed, where the picture is
-            path, clearances, chebyshev_points, matrix, unit = (
-                values.to(pixels.device)
-                for values in (*known, *_from_chebyshev(fitted.degree, count), relative_to[part])
+            asked = relative_to[part], relative_to[part] if whole is None else whole[part]
+            path, clearances, chebyshev_points, matrix, unit, energy = (
+                values.to(pixels.device) for values in (*known, *_from_chebyshev(fitted.degree, count), *asked)
             )
             low = matrix.to(pixels.dtype)
             openings = Openings(edge_distance(low @ _limiting(clearances[:, colours]).to(pixels.dtype) @ low.mT))
@@ -285,13 +285,12 @@ def images(
                 image = squared(_first(_first(field, length, 2 * points + 1).mT, length, 2 * points + 1).mT)
                 if not pixels.integrate:
                     image = _every(image, int(per_pixel))
-                light = Pixels(pixels.shape, points_per_pixel, integrate=pixels.integrate).of_image(image)
-                factor = spacing**2 / unit[:, index]
-                if whole:
-                    factor = factor * passed.sum((-2, -1)) / light.sum((-2, -1))
+                seen = Pixels(pixels.shape, points_per_pixel, integrate=pixels.integrate).of_image(image)
+                if whole is None:
+                    factor = (spacing**2 * pixels.pitch / wavelength) ** 2 / unit[:, index]
                 else:
-                    factor = factor * (spacing * pixels.pitch / wavelength) ** 2
-                lights.append(light * factor[:, None, None].to(pixels.dtype))
+                    factor = energy[:, index] / unit[:, index] / seen.sum((-2, -1))
+                lights.append(seen * factor[:, None, None].to(pixels.dtype))
             found.append(torch.stack(lights, dim=1))
         order += indices
     return _ordered(found, torch.tensor(order), dim=0)

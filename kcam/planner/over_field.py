@@ -1,0 +1,343 @@
+"""What choices change in a picture whose PSF varies over it, from spectra: of its parts, each with PSFs of one place.
+
+    E^2 = sum_p E_p^2,   E_p by the spectra of what stands in a part, and transfer functions in its middle
+
+What moves light (distortion), or dims it smoothly, is told by the light that it moves.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcam.camera import Camera
+from kcam.optics import Imaging
+from kcam.optics.accuracy import OVER_THE_FIELD
+from kcam.optics.banks import KEPT, middle
+from kcam.optics.field import PROBE, SHARED, FieldBank, nodes_apart
+from kcam.optics.numerics import lagrange_weights, linear_weights
+from kcam.optics.rendering.zones import Axis
+from kcam.optics.wavelengths import chebyshev_wavelengths
+from kcam.planner.band_counts import FEW_BANDS
+from kcam.planner.light import blurred, compressed, contrast, few_lights, hues, recorded
+from kcam.planner.samples import Sample
+from kcam.planner.spectra import COLOURS, WINDOW, Care, Spectra
+from kcam.planner.transfers import Transfers, Way
+from kcam.scene import Scene
+
+TOLD = {"blur", "spacing", *COLOURS, *WINDOW, *OVER_THE_FIELD}
+"""Changes of an Imaging over the field whose cost is told."""
+
+MOVES = ("distortion", "relative_illumination")
+"""Of these, those that act on light before it is blurred."""
+
+_FEW = {"bands": FEW_BANDS}
+_OUTER = 0.29  # of a side, either part beside that in its middle: charts have edges at thirds, which a cut would hide
+_MIDDLE = 0.78  # of half a side, the place that stands for the outer third of it: what grows with the square, or the
+# fourth power, of the distance from the axis has its mean square at 0.69 and 0.74
+_TRIED = 2 * PROBE  # pixels between nodes, whose error tells how far apart they may be: it goes with the square
+_RADII, _POWERS, _GRID = 8, 3, 16  # places that tell where light falls, of how many even powers; and of a picture
+_COLOURS, _FEWER, _LEFT = 14, 10, 7e-3  # wavelengths of which the transfer functions of all others are polynomials,
+# where so many are off from these by so little, of usual light (RMS): beyond twice that a choice was told 0.25 times
+
+
+class OverField:
+    """A sample of scenes, as `Spectra` are: the same questions."""
+
+    def __init__(self, camera: Camera, imaging: Imaging, sample: Sample) -> None:
+        self.sample, self.imaging = sample, imaging
+        self.scene = compressed(sample.scene)
+        self.weights = recorded(camera, sample.scene)
+        self._unlike = torch.ones(len(sample.owners), dtype=torch.float64)  # see `compare`
+        self._moved_known: dict[tuple[bool, ...], Tensor] = {}
+
+    @functools.cached_property
+    def _parts(self) -> list[tuple[Tensor, Spectra, _TransfersAt]]:
+        """Rows of the sample (M,), each as often as parts of it see one PSF, the spectra of these parts, and what the
+        optics do there.
+        """
+        alike: dict[Any, list[tuple[int, Scene]]] = defaultdict(list)
+        for row, scene, (x, y) in self._cut():
+            alike[(x, y) if self.imaging.centre else (abs(x), abs(y))].append((row, scene))  # others mirror it
+        optics, found = _TransfersAt(self.imaging, self.scene, self.sample.picture), []
+        for place, parts in alike.items():
+            rows, scenes = zip(*parts, strict=True)
+            there = optics.at(place)
+            found.append((torch.tensor(rows), Spectra(there, _together(scenes), self.weights), there))
+        return found
+
+    @functools.cached_property
+    def _wholes(self) -> list[tuple[float, Spectra]]:
+        """What windows cost, whose waves are longer than the parts: the spectra of the whole sample with the PSFs of
+        each place, and the share of the sample that sees these.
+        """
+        sizes = [len(rows) * math.prod(spectra.scene.shape[1:]) for rows, spectra, _ in self._parts]
+        own = (Spectra(there, self.scene, self.weights) for *_, there in self._parts)
+        return [(size / sum(sizes), spectra) for size, spectra in zip(sizes, own, strict=True)]
+
+    def _cut(self) -> Iterator[tuple[int, Scene, tuple[float, float]]]:
+        """Of each row of the sample parts, and the places that stand for these."""
+        for row in range(len(self.sample.owners)):
+            scene = self.scene.samples([row])
+            if self.sample.places is not None:
+                yield row, scene, self.sample.places[row]
+                continue
+            rows, columns = map(_thirds, scene.shape[1:])
+            for (top, height, y), (left, width, x) in ((one, other) for one in rows for other in columns):
+                yield row, scene.crop(top=top, left=left, height=height, width=width), (x, y)
+
+    def energies(
+        self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
+    ) -> tuple[Tensor, Tensor]:
+        """As `Spectra.energies`."""
+        found = torch.zeros(2, len(self._unlike), dtype=torch.float64)
+        alike = {*MOVES} if changes.get("spacing") != against.get("spacing") else {*MOVES, "spacing"}
+        ours, theirs = ({name: own[name] for name in own.keys() - alike} for own in (changes, against))
+        if self.sample.places is None and _differ(ours, theirs, WINDOW):
+            for share, spectra in self._wholes:
+                found += share * torch.stack(spectra.energies(ours, theirs, care))
+        else:
+            for rows, spectra, _ in self._parts:
+                found.index_add_(1, rows, torch.stack(spectra.energies(ours, theirs, care)))
+        off, all_of_it = found
+        if _differ(ours, theirs, {"field_variation", "spacing"}):
+            off = off + (self._thinned(ours) - self._thinned(theirs)) ** 2 * all_of_it
+        before, after = map(self._moves, (against, changes))
+        if before != after:
+            off = off + self._blurred(self._moved(after) - self._moved(before), theirs)
+        return off * self._unlike, all_of_it
+
+    @functools.cached_property
+    def _factors(self) -> Tensor:
+        """Of r c(r / R), how far light falls beside the places that stand for it, c_0 + c_1 (r / R)^2 + ..., of a lens
+        that is round, up to its farthest place R [pixels].
+        """
+        *_, optics = self._parts[0]
+        parts = torch.linspace(0, 1, _RADII + 1, dtype=torch.float64)[1:]
+        places = self._axis + self._reach * torch.stack([parts, torch.zeros_like(parts)], dim=1)
+        off = optics.beside(places, self.imaging.filled(self.scene)[0][:1])
+        powers = torch.arange(0, 2 * _POWERS, 2)
+        return torch.linalg.lstsq(parts[:, None] ** (1 + powers), off[:, None] / self._reach).solution[:, 0]
+
+    @property
+    def _reach(self) -> float:
+        return self.imaging.reach(self.sample.picture) / self.imaging.pixel_pitch
+
+    @property
+    def _axis(self) -> Tensor:
+        """Where it lies, x and y from the picture's middle [pixels]."""
+        return torch.tensor(self.imaging.centre or (0.0, 0.0), dtype=torch.float64) / self.imaging.pixel_pitch
+
+    def _beside(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far light of columns and rows falls beside them, (2, Y, X) [pixels]."""
+        from_axis = torch.stack(torch.meshgrid(x, y, indexing="xy")) - self._axis[:, None, None]
+        far = from_axis.norm(dim=0) / self._reach
+        return from_axis * (far[..., None] ** torch.arange(0, 2 * _POWERS, 2) @ self._factors)
+
+    def _thinned(self, settings: Mapping[str, Any]) -> float:
+        """How much less, or more, light falls on pixels than by PSFs of each place, RMS. Where it falls beside the
+        places that stand for it, the farther the farther these are from the axis, it spreads over more of the sensor;
+        of light that nodes share, as these alone say.
+        """
+        apart, sides = self.imaging.changed(**settings).accuracy.node_spacing, self.sample.picture[::-1]
+        if apart is None:
+            return 0.0
+        x, y = ((torch.arange(_GRID, dtype=torch.float64) + 0.5) * n / _GRID - n / 2 for n in sides)
+
+        def spread(beside: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+            wider = beside(x + 0.5, y)[0] - beside(x - 0.5, y)[0]
+            return wider + beside(x, y + 0.5)[1] - beside(x, y - 0.5)[1]
+
+        off = spread(self._beside)
+        across, down = (Axis.of(n, 1, apart=apart).nodes for n in sides)
+        known = self._beside(across, down)
+        off = off - spread(lambda x, y: linear_weights(down, y) @ known @ linear_weights(across, x).T)
+        return float(off.square().mean().sqrt())
+
+    def _moves(self, settings: Mapping[str, Any]) -> tuple[bool, ...]:
+        accuracy = self.imaging.accuracy.settings() | dict(settings)
+        return tuple(accuracy["blur"] and accuracy[name] for name in MOVES)
+
+    def _moved(self, moves: tuple[bool, ...]) -> Tensor:
+        """What is recorded, (B, J, H, W), as so much of the optics brings it to the picture."""
+        if moves not in self._moved_known:
+            planes, sample = self._light, self.sample
+            own = self.imaging.changed(**dict(zip(MOVES, moves, strict=True)))
+            if any(moves) and sample.places is None:
+                planes = own.moved(self.scene, planes)
+            elif any(moves):
+                reach = own.reach(sample.picture)
+                parts = [own.part(place, reach=reach) for place in sample.places or ()]
+                rows = zip(parts, planes.split(1), strict=True)
+                planes = torch.cat([part.moved(self.scene.samples([k]), one) for k, (part, one) in enumerate(rows)])
+            self._moved_known[moves] = planes
+        return self._moved_known[moves]
+
+    def _blurred(self, light: Tensor, settings: Mapping[str, Any]) -> Tensor:
+        """The energy of light (B, J, H, W) that is blurred as the first part is, (B,)."""
+        _, spectra, optics = self._parts[0]
+        vergences = spectra.imaging.filled(spectra.scene)[0][:1]
+        transfer = optics.of(optics.stage(settings), vergences, optics.wavelengths, Way.PSFS)[0].mean(1)
+        hue_by_hue = (blurred(hue, transfer, optics.frequencies, "reflect")[0] for hue in light.split(1, dim=1))
+        return torch.stack(list(hue_by_hue)).sum(0)
+
+    @functools.cached_property
+    def apart(self) -> int:
+        """About how many pixels the nodes of the reference lie apart."""
+        longest = max(self.sample.picture)
+        tried = min(_TRIED, longest)
+        off, all_of_it = self.energies({**_FEW, "spacing": tried}, _FEW)
+        error = SHARED * float((off / all_of_it.clamp(min=1e-300)).max()) ** 0.5
+        return min(nodes_apart(error, tried)[0], longest)
+
+    def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> bool:
+        """As `Spectra.compare`."""
+        said = self.energies(settings, settings)[1]
+        self._unlike = (said / recorded.to(said).clamp(min=1e-300)).clamp(min=1)
+        return True
+
+    def frame(self, settings: Mapping[str, Any]) -> bool:
+        """As `Spectra.frame`: what is lost beyond borders is not known without PSFs."""
+        return False
+
+    @property
+    def unlike(self) -> float:
+        """As of `Spectra`."""
+        return float(self._unlike.max())
+
+    def dimmed(self, settings: Mapping[str, Any]) -> list[float]:
+        """As `Spectra.dimmed`."""
+        sharp, seen = (self.energies(own, own)[1] for own in ({**settings, "blur": False}, settings))
+        found: list[float] = (sharp / seen.clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
+        return found
+
+    @functools.cached_property
+    def _light(self) -> Tensor:
+        return hues(self.scene, self.weights)
+
+    @functools.cached_property
+    def contrast(self) -> Tensor:
+        """As of `Spectra`."""
+        return contrast(self._light)
+
+    @functools.cached_property
+    def few_lights(self) -> Tensor:
+        """As of `Spectra`."""
+        return few_lights(self._light.square().sum(1, keepdim=True).sqrt())
+
+
+class _TransfersAt(Transfers):
+    """Those of places of a picture."""
+
+    def __init__(self, imaging: Imaging, scene: Scene, picture: tuple[int, int]) -> None:
+        super().__init__(imaging, scene, picture)
+        self.place = 0.0, 0.0
+        self._banks: dict[Any, Tensor] = {}
+
+    def at(self, place: tuple[float, float]) -> _TransfersAt:
+        """The same at another place, x and y from the picture's middle [pixels]; what they know is shared."""
+        own = type(self).__new__(type(self))
+        vars(own).update(vars(self), place=place)
+        return own
+
+    def beside(self, places: Tensor, vergences: Tensor) -> Tensor:
+        """How far light of places (N, 2) falls beside them along x, (N,) [pixels]."""
+        field = self._field(self.imaging, vergences, self.few, self.window(self.imaging, vergences))
+        rows = field.bank(places).double().sum((1, 2, 3)).cpu()
+        return rows @ (torch.arange(rows.shape[1]) - rows.shape[1] // 2).double() / rows.sum(1)
+
+    def slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
+        """By PSFs there, and what they are off by between nodes."""
+        accuracy, window = imaging.accuracy, self.window(imaging, vergences)
+        if not accuracy.blur:
+            return super().slices(imaging, vergences, wavelengths, way, grey=grey)
+        key = self.place, tuple(vergences.tolist()), tuple(wavelengths.tolist()), *accuracy.settings().values()
+        if key not in self._sliced:
+            found = self._by_colours(imaging, vergences, wavelengths)
+            if accuracy.spacing is not None and accuracy.field_variation:
+                field = self._field(imaging, vergences, wavelengths, window)
+                found = found + self.slices_of(field.off_between_nodes(self.place, self.picture))
+            self._sliced[key] = found
+        return self._sliced[key]
+
+    def _by_colours(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor) -> Tensor:
+        """Those of all wavelengths by a polynomial through `_COLOURS`, where fewer would nearly do; but of a few where
+        lateral colour is left out.
+        """
+        usual = imaging.accuracy.lateral_colour is self.imaging.accuracy.lateral_colour
+        if not usual or len(self.wavelengths) <= _COLOURS:
+            return self._at(imaging, vergences, wavelengths)
+        nodes, fewer = (chebyshev_wavelengths(self.wavelengths, count)[0] for count in (_COLOURS, _FEWER))
+        known = self._at(imaging, vergences, nodes)
+        left = known - _between(fewer, _between(nodes, known, fewer), nodes)
+        if float((left.abs().square().mean((0, 1, 2)) * self._usual_light).sum()) < _LEFT**2:
+            return _between(nodes, known, wavelengths)
+        return self._at(imaging, vergences, wavelengths)  # which vary too fast even for cubics between all bands
+
+    @functools.cached_property
+    def _usual_light(self) -> Tensor:
+        """The share of each ring of frequency, of pictures that have as much of any octave."""
+        octaves = torch.gradient(self.frequencies)[0] / self.frequencies.clamp(min=float(self.frequencies[1]))
+        return octaves / octaves.sum()
+
+    def _at(self, imaging: Imaging, vergences: Tensor, nodes: Tensor) -> Tensor:
+        """By the PSFs of these wavelengths: those of smaller windows are the middle of the whole."""
+        accuracy, own = imaging.accuracy, self.imaging.accuracy
+        place = self.place if accuracy.field_variation else None
+        put_back = accuracy.renormalise or own.psf_shape is None
+        key = place, *vergences.tolist(), *nodes.tolist(), accuracy.lateral_colour, put_back
+        psfs = self._banks.get(key)
+        if psfs is None:
+            whole = imaging.changed(psf_shape=own.psf_shape)
+            field = self._field(whole, vergences, nodes, self.window(whole, vergences))
+            psfs = field.bank(torch.tensor([self.place], dtype=torch.float64))[0]
+            if sum(bank.nbytes for bank in self._banks.values()) + psfs.nbytes <= KEPT:
+                self._banks[key] = psfs
+        seen = middle(psfs, self.window(imaging, vergences))
+        if not accuracy.renormalise:
+            return self.slices_of(seen)
+        light = psfs.sum((-2, -1)) / seen.sum((-2, -1))
+        return self.slices_of(seen) * light[..., None, None].double().cpu()
+
+    def _field(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> FieldBank:
+        pixels = imaging.pixels(window, self._like)
+        return imaging.field_bank(
+            self.picture, pixels, vergences=vergences, wavelengths=self.wavelengths, at=wavelengths
+        )
+
+    @property
+    def _widest(self) -> None:
+        """Nothing is known but PSFs."""
+
+
+def _between(nodes: Tensor, known: Tensor, wavelengths: Tensor) -> Tensor:
+    """Slices at wavelengths (G,) by a polynomial through those at nodes, (Z, n, 2, F)."""
+    weights = lagrange_weights(1e-6 / nodes, 1e-6 / wavelengths.to(nodes))
+    return torch.einsum("gn,znof->zgof", weights.to(known), known)
+
+
+def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
+    return any(changes.get(name) != against.get(name) for name in names)
+
+
+def _together(scenes: Sequence[Scene]) -> Scene:
+    """One batch of scenes of one size."""
+    first, depths = scenes[0], [torch.as_tensor(scene.depth, dtype=torch.float64).reshape(-1) for scene in scenes]
+    depth = torch.cat(depths) if len(scenes) > 1 else first.depth
+    return replace(first, coefficients=torch.cat([scene.coefficients for scene in scenes]), depth=depth)
+
+
+def _thirds(side: int) -> list[tuple[int, int, float]]:
+    """Start, length, and the place that stands for it from the middle, of parts of a side [pixels]."""
+    outer = int(_OUTER * side)
+    if outer == 0:
+        return [(0, side, 0.0)]
+    away = _MIDDLE * side / 2
+    return [(0, outer, -away), (outer, side - 2 * outer, 0.0), (side - outer, outer, away)]
