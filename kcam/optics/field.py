@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -94,8 +95,8 @@ class _How:
 
 @dataclass(frozen=True)
 class _Detail:
-    """Those parts of a picture that hold most of its detail, with what lies around them; how much more of it the whole
-    has; the picture's light, squared and summed.
+    """Those parts of a picture that hold most of its detail, with what lies around them, those of one size together;
+    how much more of it the whole has; the picture's light, squared and summed.
     """
 
     patches: list[tuple[Tensor, Tensor | None]]
@@ -322,7 +323,15 @@ class FieldPicture(FieldBank):
         detail = _detail(planes)
         most = detail.flatten().argsort(descending=True)[:_PATCHES]
         places = [divmod(at, detail.shape[1]) for at in most.tolist()]
-        patches = [(self._patch(planes, at), None if shares is None else self._patch(shares, at)) for at in places]
+        alike: dict[torch.Size, list[tuple[int, int]]] = defaultdict(list)
+        for at in places:
+            alike[self._patch(planes[:1, :1], at).shape].append(at)
+
+        def together(of: Tensor, own: list[tuple[int, int]]) -> Tensor:
+            return torch.cat([self._patch(of, at) for at in own])
+
+        found = alike.values()
+        patches = [(together(planes, own), None if shares is None else together(shares, own)) for own in found]
         step = max(1, math.isqrt(height * width // _SAMPLED))
         point = bank(torch.zeros(1, 2, dtype=torch.float64))[0].sum((-2, -1), keepdim=True)[:1]
         light = self.render(point, planes[..., ::step, ::step].contiguous(), None).double().square().sum() * step**2

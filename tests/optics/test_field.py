@@ -445,3 +445,25 @@ def test_nodes_that_mirror_each_other_have_as_many_pixels() -> None:
             sizes = [last - first for first, last in map(axis.reach, range(len(axis.nodes)))]
             assert sizes == sizes[::-1], (n, apart)
             assert torch.allclose(axis.weights.sum(0), torch.ones(n + 30, dtype=DOUBLE), atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["phone", "phone_odd", "cooke_triplet", pytest.param("ef50", marks=pytest.mark.slow)])
+def test_a_smaller_window_holds_the_middle_of_a_psf_and_all_of_its_light(name: str) -> None:
+    """It takes fewer samples of the pupil, of whose edge these know less: 1.3 % of a PSF's light, and 0.8 % of its
+    brightness, were off where they took the edge of an asphere's pupil for straight.
+    """
+    draw = Draw(len(name))
+    lens, pitch = optics.CompoundLens.preset(name, focus_distance=2.0), draw.number(1, 3) * um
+    reach = 100 * pitch
+    psfs = lens.over_field(reach, torch.tensor([0.5], dtype=torch.float64), torch.tensor([450, 650]).double() * nm)
+    places = reach * torch.tensor([[0.0, 0.0], [draw.number(0, 0.7), draw.number(0, 0.7)]], dtype=torch.float64)
+    with torch.no_grad():
+        whole = psfs.bank(places, PixelGrid(pitch, (161, 161)), whole=True).double()
+        for side in (17, 33, 65):
+            seen = whole[..., 80 - side // 2 : 81 + side // 2, 80 - side // 2 : 81 + side // 2]
+            if float((seen.sum((-2, -1)) / whole.sum((-2, -1))).min()) < 0.95:
+                continue
+            own = psfs.bank(places, PixelGrid(pitch, (side, side)), whole=True).double()
+            torch.testing.assert_close(own.sum((-2, -1)), whole.sum((-2, -1)), rtol=1e-5, atol=0)
+            off = own - seen * (whole.sum((-2, -1)) / seen.sum((-2, -1)))[..., None, None]
+            assert float(off.abs().sum((-2, -1)).max()) < 3e-3
