@@ -29,7 +29,7 @@ RATES: dict[str, float] = {row.kind: row.rate for row in optics.PROPAGATORS.valu
     "psf": 3.5e-4,
     "field": 8e-2,
     "field psf": 2e-3,
-    "field point": 1.5e-7,
+    "field point": 1e-8,
     "transform": 1.5e-10,
     "product": 3e-10,
     "touch": 6e-10,

@@ -96,7 +96,7 @@ def test_transfer_functions_of_pixels_with_gaps_are_those_of_psfs(fill: float, p
         for side in (5, 17, 49):
             own = imaging.changed(psf_shape=(side, side))
             ways = transfers.Way.LINES, transfers.Way.PSFS
-            found, expected = (told._slices(own, *asked, way, grey=False) for way in ways)
+            found, expected = (told.slices(own, *asked, way, grey=False) for way in ways)
             near = told.frequencies < 0.35
             assert float((found - expected)[..., near].abs().max()) < 0.02 + 0.03 * bool(plate)
             assert float((found / expected - 1)[..., 0].abs().max()) < 0.01 + 0.03 * bool(plate)
