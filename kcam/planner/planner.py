@@ -31,9 +31,10 @@ from kcam.scene import Scene
 from kcam.sensor import ShotNoise
 from kcam.threads import no_more_than_free
 
-WORTH, WORTH_DEEP, WORTH_LIGHTS = 0.12, 0.19, 0.7
+WORTH, WORTH_DEEP, WORTH_LIGHTS, WORTH_FIELD = 0.12, 0.19, 0.7, 5.0
 """Predicted seconds of a reference picture up to which a plan for it alone may take longer than it saves, with a map of
-depth, and of a few lights that stand out in any picture; each picture of a batch adds an eighth: measured.
+depth, of a few lights that stand out in any picture, and over the field; each picture of a batch adds an eighth:
+measured.
 """
 
 SENSOR = "sensor"
@@ -78,8 +79,8 @@ def shoot(
     camera: Camera, scene: Scene, *, tolerance: float | str, generator: torch.Generator | None = None
 ) -> tuple[torch.Tensor, Plan]:
     """One picture within a tolerance, and the plan for it, made and used where that pays: with the PSFs that making it
-    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and where optics vary over the
-    picture, whose choices are tried out.
+    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and where choices are tried out,
+    of optics that vary over the picture with a map of depth.
 
     Arguments and errors: as `make_plan`, and as `Camera`.
 
@@ -133,9 +134,10 @@ class Planner:
         scene, imaging = self.prices.scene, self.evaluator.imaging
         if imaging is None or not scene.coefficients.numel():
             return False
-        if self.evaluator.varies and self.evaluator.over_field is None:
+        varies = self.evaluator.varies
+        if varies and (is_deep(scene) or self.evaluator.over_field is None):
             return False
-        worth = WORTH_DEEP if is_deep(scene) else WORTH
+        worth = WORTH_FIELD if varies else WORTH_DEEP if is_deep(scene) else WORTH
         if bool((lights(scene.coefficients.detach().sum(1, keepdim=True)) < FEW).any()):
             worth = max(worth, WORTH_LIGHTS)
         usual = self.prices.rates | costs.RATES  # on a slower machine a plan takes longer, too

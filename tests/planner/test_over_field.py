@@ -80,6 +80,9 @@ def test_a_single_picture_over_the_field_is_planned_without_trials(monkeypatch: 
     forward = optics.Imaging.forward
     monkeypatch.setattr(optics.Imaging, "forward", lambda *a, **k: rendered.append(1) or forward(*a, **k))
     with torch.no_grad():
+        assert not shoot(camera, scene, tolerance=0.03)[1].changes  # a plan takes as long as this picture
+        monkeypatch.setattr("kcam.planner.planner.WORTH_FIELD", 0.0)
+        rendered.clear()
         _, plan = shoot(camera, scene, tolerance=0.03)
     assert plan.changes
     assert len(rendered) <= 3  # the picture, and what the sensor is given, without blur or with little
