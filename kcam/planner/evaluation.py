@@ -164,7 +164,7 @@ class Evaluator:
         """See the same without blur, where that tells as much: of light of which nothing is cut off, as of a few lights
         that stand out, and not more where pixels see little of its colour.
         """
-        known = isinstance(imaging.lens, (Lens, CompoundLens))  # whose PSFs brighten nothing
+        known = isinstance(imaging.lens, Lens) or self.varies  # whose PSFs brighten nothing
         if not known or self.few_lights:
             return False
         self.signals = self._signals(sharp := {**settings, "blur": False})

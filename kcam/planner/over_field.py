@@ -2,7 +2,9 @@
 
     E^2 = sum_p E_p^2,   E_p by the spectra of what stands in a part, and transfer functions in its middle
 
-What moves light (distortion), or dims it smoothly, is told by the light that it moves.
+Windows cost what they do to waves longer than parts, too: of the whole, with the PSFs of each place. What moves light
+(distortion), or dims it smoothly, is told by the light that it moves; and where PSFs bring light beside their places,
+it is spread over more or less of the sensor than by one PSF.
 """
 
 from __future__ import annotations
@@ -40,10 +42,11 @@ MOVES = ("distortion", "relative_illumination")
 
 _FEW = {"bands": FEW_BANDS}
 _OUTER = 0.29  # of a side, either part beside that in its middle: charts have edges at thirds, which a cut would hide
-_MIDDLE = 0.78  # of half a side, the place that stands for the outer third of it: what grows with the square, or the
-# fourth power, of the distance from the axis has its mean square at 0.69 and 0.74
+_MIDDLE = 0.78  # of half a side, the place that stands for its outer part: a little farther than where what grows with
+# the distance from the axis, or its square, has its mean square (0.73, 0.76; with its fourth power 0.81)
 _TRIED = 2 * PROBE  # pixels between nodes, whose error tells how far apart they may be: it goes with the square
-_RADII, _POWERS, _GRID = 8, 3, 16  # places that tell where light falls, of how many even powers; and of a picture
+_RADII, _POWERS = 8, 3  # places that tell how far light falls beside them, and even powers of the distance for that
+_GRID = 16  # places along a side of a picture, at which that is looked at
 _COLOURS, _FEWER, _LEFT = 14, 10, 7e-3  # wavelengths of which the transfer functions of all others are polynomials,
 # where so many are off from these by so little, of usual light (RMS): beyond twice that a choice was told 0.25 times
 
