@@ -491,9 +491,8 @@ def _support(view: _View) -> Iterator[Ladder]:
         return [] if plain is top else [level(int(plain.fineness), renormalise=True)]
 
     levels = [*levels, top]
-    alternatives = (
-        None if pixels or over_field else rescaled
-    )  # which line spreads told to cost 0.3 to 1.2 times what they do
+    # behind maps line spreads told rescaled ones to cost 0.3 to 1.2 times what they do
+    alternatives = None if pixels or over_field else rescaled
     ladder = Ladder("PSF support", levels, beside, alternatives=alternatives, from_top=view.evaluator.certain)
     ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
     if pixels:

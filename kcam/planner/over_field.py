@@ -30,7 +30,7 @@ from kcam.optics.wavelengths import chebyshev_wavelengths
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.light import blurred, compressed, contrast, few_lights, hues, recorded
 from kcam.planner.samples import Sample
-from kcam.planner.spectra import COLOURS, WINDOW, Care, Spectra
+from kcam.planner.spectra import COLOURS, WINDOW, Care, Spectra, differ
 from kcam.planner.transfers import Transfers, Way
 from kcam.scene import Scene
 
@@ -103,14 +103,14 @@ class OverField:
         found = torch.zeros(2, len(self._unlike), dtype=torch.float64)
         alike = {*MOVES} if changes.get("spacing") != against.get("spacing") else {*MOVES, "spacing"}
         ours, theirs = ({name: own[name] for name in own.keys() - alike} for own in (changes, against))
-        if self.sample.places is None and _differ(ours, theirs, WINDOW):
+        if self.sample.places is None and differ(ours, theirs, WINDOW):
             for share, spectra in self._wholes:
                 found += share * torch.stack(spectra.energies(ours, theirs, care))
         else:
             for rows, spectra, _ in self._parts:
                 found.index_add_(1, rows, torch.stack(spectra.energies(ours, theirs, care)))
         off, all_of_it = found
-        if _differ(ours, theirs, {"field_variation", "spacing"}):
+        if differ(ours, theirs, {"field_variation", "spacing"}):
             off = off + (self._thinned(ours) - self._thinned(theirs)) ** 2 * all_of_it
         before, after = map(self._moves, (against, changes))
         if before != after:
@@ -324,10 +324,6 @@ def _between(nodes: Tensor, known: Tensor, wavelengths: Tensor) -> Tensor:
     """Slices at wavelengths (G,) by a polynomial through those at nodes, (Z, n, 2, F)."""
     weights = lagrange_weights(1e-6 / nodes, 1e-6 / wavelengths.to(nodes))
     return torch.einsum("gn,znof->zgof", weights.to(known), known)
-
-
-def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
-    return any(changes.get(name) != against.get(name) for name in names)
 
 
 def _together(scenes: Sequence[Scene]) -> Scene:

@@ -135,13 +135,13 @@ class Planner:
         if imaging is None or not scene.coefficients.numel():
             return False
         varies = self.evaluator.varies
-        if varies and (is_deep(scene) or self.evaluator.over_field is None):
-            return False
         worth = WORTH_FIELD if varies else WORTH_DEEP if is_deep(scene) else WORTH
         if bool((lights(scene.coefficients.detach().sum(1, keepdim=True)) < FEW).any()):
             worth = max(worth, WORTH_LIGHTS)
         usual = self.prices.rates | costs.RATES  # on a slower machine a plan takes longer, too
-        return costs.seconds(self.prices.work({}), usual) > worth * (1 + scene.shape[0] / 8)
+        if costs.seconds(self.prices.work({}), usual) <= worth * (1 + scene.shape[0] / 8):
+            return False
+        return not varies or self.evaluator.over_field is not None  # which takes a look at the scene
 
     @no_more_than_free()
     @unchanged()

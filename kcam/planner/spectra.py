@@ -302,13 +302,13 @@ class Spectra:
         return off * self._unlike, all_of_it
 
     def _energies(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> tuple[Tensor, Tensor]:
-        if care is not Care.FULL and not _differ(changes, against, WINDOW):
+        if care is not Care.FULL and not differ(changes, against, WINDOW):
             changes, against = {**changes, "bands": 1}, {**against, "bands": 1}
         if changes.get("layers") == against.get("layers"):
-            colours, replaced = not _differ(changes, against, LINEAR - COLOURS), self._replaced
+            colours, replaced = not differ(changes, against, LINEAR - COLOURS), self._replaced
             if colours and self._hides:
                 replaced = torch.where(self.few_lights, _HIDDEN_LIGHTS, replaced)
-            elif _differ(changes, against, WINDOW):
+            elif differ(changes, against, WINDOW):
                 through = self.few_lights & (replaced == _SEEN_THROUGH)
                 replaced = torch.where(through, _SEEN_THROUGH_LIGHTS, replaced)
             off, all_of_it = self._linear(changes, against, care, replaced)
@@ -327,7 +327,7 @@ class Spectra:
         where much is hidden, and all of it where light of some layers does not fall into the window (`_LOST`): there
         masks have colours, and errors are relative to what they leave of the light behind.
         """
-        lost, colours = self.optics.lost_between_ends, not _differ(changes, against, LINEAR - COLOURS)
+        lost, colours = self.optics.lost_between_ends, not differ(changes, against, LINEAR - COLOURS)
         if colours and lost < _LOST:
             return self._of_other_colours(changes, against, care, hidden)
         of_masks = {**changes, **WHOLE}, {**against, **WHOLE}
@@ -423,12 +423,12 @@ class Spectra:
         way, more = self._way(changes, against, care)
         # layers lie between others, and windows cut the same off all of them: 1.0 to 1.2 times the truth, measured
         corners = 1.0 if changes.get("layers") != against.get("layers") else self.optics.corners
-        colours = not _differ(changes, against, LINEAR - COLOURS)
+        colours = not differ(changes, against, LINEAR - COLOURS)
         factor = torch.tensor(corners, dtype=torch.float64)
         if colours:
             factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
         factor = factor * more
-        if _differ(changes, against, {"interpolate_bands"}):
+        if differ(changes, against, {"interpolate_bands"}):
             of_lights = _BETWEEN_LIGHTS if self.optics.has_pixel_phase else _BETWEEN_PSFS
             factor = factor * torch.where(self.few_lights, of_lights, _BETWEEN_PSFS).double()
         if PARAXIAL.items() <= changes.items() and PARAXIAL.items() <= against.items():
@@ -438,7 +438,7 @@ class Spectra:
             # that with the larger window first
             theirs, ours = (self._once(index, layered, own, against, way) for own in (against, changes))
             found[0, rows], found[1, rows] = self._energy(ours - theirs, layered), self._all_of_it(index, against, way)
-            if way is Way.LINES and _differ(changes, against, {"propagator"}):
+            if way is Way.LINES and differ(changes, against, {"propagator"}):
                 least = self.optics.untold(self.optics.stage(against), layered.vergences, self.wavelengths)
                 found[0, rows] = found[0, rows].maximum(least**2 * found[1, rows])
             if len(layered.vergences) > 1:
@@ -453,12 +453,12 @@ class Spectra:
 
     def _way(self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care) -> tuple[Way, float]:
         """How transfer functions are found that tell of changes, and times the error that they tell."""
-        by_psfs = _differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
-        if by_psfs or (_differ(changes, against, COLOURS | {"layers"}) and self.optics.missed):
+        by_psfs = differ(changes, against, WITH_PSFS if care is Care.FULL else WITH_PSFS - TOLD_BY_LINES)
+        if by_psfs or (differ(changes, against, COLOURS | {"layers"}) and self.optics.missed):
             return Way.PSFS, 1.0
         if care is Care.AT_FIRST:
             return Way.WHOLE_LINES, 1.0
-        if _differ(changes, against, COLOURS):
+        if differ(changes, against, COLOURS):
             return self._way_of_colours(changes.get("bands"), against)
         return Way.LINES, 1.0
 
@@ -601,7 +601,8 @@ def _drowned(hidden: Tensor) -> Tensor:
     return (hidden - _DROWNED).clamp(0, 1)
 
 
-def _differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
+def differ(changes: Mapping[str, Any], against: Mapping[str, Any], names: set[str]) -> bool:
+    """Whether two settings have other values of some of these names."""
     return any(changes.get(name) != against.get(name) for name in names)
 
 

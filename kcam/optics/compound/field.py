@@ -59,9 +59,7 @@ class FieldPSFs:
     middle: Tensor | None = None  # wavelength whose light illuminates [m], () of those that were traced
     illuminates: Even | None = None  # which takes as long to know as a PSF
     windows: dict[float, tuple[int, int]] = field(default_factory=dict, repr=False)  # by pitch
-    units: dict[tuple[float, ...], Tensor] = field(
-        default_factory=dict, repr=False
-    )  # without gradients, by wavelengths
+    units: dict[tuple[float, ...], Tensor] = field(default_factory=dict, repr=False)  # without graphs, by wavelengths
 
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
         """Of others (L,) [m] in the same range; see `source.FieldPSFs`. They illuminate alike."""
