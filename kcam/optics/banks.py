@@ -117,7 +117,7 @@ class Banks:
     mirrored: bool = True
     few: bool = True
 
-    kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)
+    kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, repr=False)  # of each place
 
     def bank(
         self,
@@ -131,18 +131,27 @@ class Banks:
         """PSFs (F, Z, L, h, w) of places (F, 2) [m]; of many wavelengths the PSFs' pixels are polynomials through those
         of a few. Without gradients they are kept, up to `KEPT` bytes. whole, mixing, colours: see `source.FieldPSFs`.
         """
-        key = (pixels, whole, colours, _bytes(mixing), _bytes(places))
-        if key in self.kept:
-            return self.kept[key]
-        nodes, shares = self._few(colours)
-        if mixing is not None:
-            shares = mixing.to(shares) @ shares
-        each = len(nodes) == len(self.wavelengths) and mixing is None  # stands for itself
-        found = self._distinct(places, pixels, nodes, None if each else shares, whole=whole).to(pixels.device)
-        held = sum(bank.nbytes for bank in self.kept.values())
-        if not found.requires_grad and held + found.nbytes <= KEPT:
-            self.kept[key] = found
-        return found
+        height, width = pixels.shape
+        odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
+        grain = 1e-6 * pixels.pitch
+        own, which = ((places.abs() if self.mirrored else places) / grain).round().unique(dim=0, return_inverse=True)
+        how = (odd, whole, colours, _bytes(mixing), torch.is_grad_enabled())  # those without a graph never serve one
+        keys = [(how, *place) for place in own.tolist()]
+        found = {key: self.kept[key] for key in keys if key in self.kept}
+        if missing := [row for row, key in enumerate(keys) if key not in found]:
+            psfs = self._compute(own[missing] * grain, odd, whole=whole, mixing=mixing, colours=colours)
+            found |= zip((keys[row] for row in missing), psfs, strict=True)
+            held = sum(psf.nbytes for psf in self.kept.values())
+            if not psfs.requires_grad and held + psfs.nbytes <= KEPT:
+                self.kept.update(found)
+        return torch.stack([self._turned(found[keys[row]], place) for row, place in zip(which, places, strict=True)])[
+            ..., :height, :width
+        ]
+
+    def _turned(self, psf: Tensor, place: Tensor) -> Tensor:
+        """That of a place with positive x and y, as it is at one that mirrors it."""
+        turned = [axis for axis, side in zip((-1, -2), place.tolist(), strict=True) if self.mirrored and side < 0]
+        return psf.flip(turned) if turned else psf
 
     @property
     def fewer(self) -> tuple[int, ...]:
@@ -155,25 +164,16 @@ class Banks:
             return self.wavelengths, torch.eye(len(self.wavelengths), dtype=torch.float64)
         return chebyshev_wavelengths(self.wavelengths, int(count))
 
-    def _distinct(
-        self, places: Tensor, pixels: PixelGrid, nodes: Tensor, shares: Tensor | None, *, whole: bool
+    def _compute(
+        self, places: Tensor, pixels: PixelGrid, *, whole: bool, mixing: Tensor | None, colours: float
     ) -> Tensor:
-        height, width = pixels.shape
-        odd = replace(pixels, shape=(height + 1 - height % 2, width + 1 - width % 2))  # about the middle
-        grain = 1e-6 * pixels.pitch
-        own, which = ((places.abs() if self.mirrored else places) / grain).round().unique(dim=0, return_inverse=True)
-        psfs = self.compute(own * grain, nodes, odd, whole)
-        if shares is not None:
+        nodes, shares = self._few(colours)
+        psfs = self.compute(places, nodes, pixels, whole)
+        if mixing is not None:
+            shares = mixing.to(shares) @ shares
+        if mixing is not None or len(nodes) < len(self.wavelengths):  # else each stands for itself
             psfs = torch.einsum("ln,fznhw->fzlhw", shares.to(psfs), psfs)
-        psfs = psfs[which]
-        if self.mirrored:
-            psfs = torch.stack(
-                [
-                    psf.flip([axis for axis, side in ((-1, x), (-2, y)) if side < 0])
-                    for psf, (x, y) in zip(psfs, places.tolist(), strict=True)
-                ]
-            )
-        return psfs[..., :height, :width]
+        return psfs.to(pixels.device)
 
 
 def window_side(slopes: Tensor, tail: Tensor, *, pitch: float) -> int:

@@ -43,7 +43,7 @@ _DEFAULT = Accuracy()
 _SETTINGS = _DEFAULT.settings().keys()
 _RECIPE = {field.name for field in fields(Recipe)}
 _FEW_TRACED = 4  # wavelengths that a lens's pupils are traced at; of more they are polynomials
-_TRACED = 4  # lenses, at some vergences and wavelengths, whose pupils are kept
+_TRACED, _WINDOWS = 4, 16  # lenses, at some vergences and wavelengths, whose pupils are kept, and whose windows are
 
 T = TypeVar("T")
 
@@ -136,7 +136,7 @@ class Imaging(Stage):
         self._warns = True  # of too few layers
         self._bank_cache, self._transfer_cache = ValueCache(), ValueCache()
         self._traced_cache, self._field_cache = ValueCache(_TRACED), ValueCache()
-        self._window_cache = ValueCache(_TRACED)
+        self._window_cache = ValueCache(_WINDOWS)
         self._reach: float | None = None  # from the axis, of the picture of which this is a part [m]
         self.known: KnownPSFs | None = None  # while the lens stays as it is, see `knowing`
         self._known_cache = ValueCache()
@@ -196,7 +196,7 @@ class Imaging(Stage):
     def fresh(self) -> Imaging:
         """The same stage that has kept nothing, but for the pupils that were traced."""
         own = self.changed()
-        own._field_cache, own._window_cache, own.known = ValueCache(), ValueCache(_TRACED), None
+        own._field_cache, own._window_cache, own.known = ValueCache(), ValueCache(_WINDOWS), None
         return own
 
     def knowing(self, wavelengths: Tensor) -> Imaging:
@@ -269,10 +269,13 @@ class Imaging(Stage):
             result = self._render(scene, working, contraction).to(planes.dtype)
         return result if colour_filter is None else colour_filter.finish(result)
 
-    def psf_window(self, wavelengths: Tensor, *, vergences: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
+    def psf_window(
+        self, wavelengths: Tensor, *, vergences: Tensor, picture: tuple[int, int], among: Tensor | None = None
+    ) -> tuple[int, int]:
         """Window (H, W) of the PSF [pixels]: at most 0.1 % of the light outside, or the window is the picture.
 
-        Args: wavelengths: (L,) [m]. vergences: of the layers, (Z,) [1/m]. picture: (H, W) [pixels].
+        Args: wavelengths: (L,) [m]. vergences: of the layers, (Z,) [1/m]. picture: (H, W) [pixels]. among: others
+            (N,) [1/m] with the same ends or farther ones, for which a real lens is traced instead.
         """
         if not self.accuracy.blur:
             return 1, 1
@@ -280,7 +283,11 @@ class Imaging(Stage):
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
         if self.varies:
-            return _within(self._traced(picture, vergences, wavelengths).window(pixels), picture)
+            traced = self._traced(picture, vergences if among is None else among, wavelengths)
+            own = traced if among is None else traced.at_vergences(vergences)
+            reach = self.reach(picture) if self._reach is None else self._reach
+            key = self.lens, reach, vergences, wavelengths, pixels
+            return _within(self._window_cache.get(key, lambda: own.window(pixels)), picture)
         find = functools.partial(self.lens.window, Points(vergences), wavelengths, pixels)
         if self.known is not None:
             return _within(self.known.window(vergences, wavelengths, pixels, find), picture)
@@ -466,14 +473,15 @@ class Imaging(Stage):
             return sum(works[1:], works[0])
         planes, vergences, where = (self.working(scene), *self.filled(scene)) if known is None else known
         picture, wavelengths, layers = scene.shape[1:], scene.wavelengths, len(vergences)
-        window = self.psf_window(wavelengths, vergences=vergences, picture=picture)
+        among = self.spanning(scene) if self.varies else None
+        window = self.psf_window(wavelengths, vergences=vergences, picture=picture, among=among)
         shapes = planes.new_empty(0, device="meta")
         channels = None if layers > 1 and self.accuracy.per_band else channels
         weights = None if channels is None else shapes.new_empty(channels, len(wavelengths))
         renderer = self._renderer(scene, window, weights=weights, like=shapes)
         own, pixels = PictureWork(planes, renderer, layers, self.accuracy, where), self.pixels(window, planes)
-        if self.varies:
-            points = self._traced(picture, vergences, wavelengths).points(pixels)
+        if among is not None:
+            points = self._traced(picture, among, wavelengths).at_vergences(vergences).points(pixels)
             return own.over_field(points, apart=apart, mirrored=self.centre is None)
         psfs = {}
         if isinstance(self.lens, Lens) and self.accuracy.blur:
@@ -585,20 +593,32 @@ class Imaging(Stage):
             renderer, mixing = renderer.of_sums(), renderer.mixing().flatten(0, 1)
         return FieldPicture(psfs, self.pixels(window, like), self._middle, self.accuracy, mixing, renderer)
 
-    def field_bank(
-        self, picture: tuple[int, int], pixels: PixelGrid, *, vergences: Tensor, wavelengths: Tensor, at: Tensor
-    ) -> FieldBank:
-        """PSFs of places of a picture (H, W), of layers (Z,) [1/m], `at` some wavelengths (G,) in the range of the
-        scene's (L,) [m].
+    def spanning(self, scene: Scene) -> Tensor:
+        """Vergences of the layers of a scene, (Z,) [1/m], as many as the rule says: those for which a real lens is
+        traced that is asked for others, too.
         """
-        traced = self._traced(picture, vergences, wavelengths)
-        psfs = traced.at_wavelengths(at, lateral_colour=self.accuracy.lateral_colour)
+        own = self.changed(layers=None) if is_deep(scene) and self.accuracy.layers is not None else self
+        return own.vergences(scene, torch.as_tensor(scene.depth, dtype=torch.float64))
+
+    def field_bank(
+        self,
+        picture: tuple[int, int],
+        pixels: PixelGrid,
+        *,
+        among: tuple[Tensor, Tensor],
+        vergences: Tensor,
+        wavelengths: Tensor,
+    ) -> FieldBank:
+        """PSFs of places of a picture (H, W), of layers (Z,) [1/m] and wavelengths (G,) [m], in the range of those
+        `among` which they are, of the scene.
+        """
+        traced = self._traced(picture, *among).at_vergences(vergences)
+        psfs = traced.at_wavelengths(wavelengths, lateral_colour=self.accuracy.lateral_colour)
         return FieldBank(psfs, pixels, self._middle, self.accuracy, None)
 
     def moved(self, scene: Scene, planes: Tensor) -> Tensor:
         """Planes (B, J, H, W) over a scene, as distortion and relative illumination bring them to the picture."""
-        vergences, _ = self.filled(scene)
-        field = self._field_picture(scene, vergences=vergences, weights=None, like=planes)
+        field = self._field_picture(scene, vergences=self.spanning(scene), weights=None, like=planes)
         return field.moved(planes, None)[0]
 
     @no_more_than_free()
@@ -639,11 +659,10 @@ class Imaging(Stage):
 
     @torch.no_grad()
     def _outermost(self, scene: Scene) -> tuple[Tensor, FieldPSFs]:
-        vergences, _ = self.filled(scene)
         _, height, width = scene.shape
         sides = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64) * self.pixel_pitch
         places = torch.cartesian_prod(sides * width, sides * height) + torch.tensor(self._middle, dtype=torch.float64)
-        return places, self._traced((height, width), vergences, scene.wavelengths)
+        return places, self._traced((height, width), self.spanning(scene), scene.wavelengths)
 
     def _asked(self, scene: Scene, colour_filter: Absorber | None) -> tuple[FieldPicture, Tensor, Tensor | None]:
         planes = self.working(scene)

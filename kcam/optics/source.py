@@ -166,6 +166,9 @@ class FieldPSFs(Protocol):
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
         """Of others (L,) [m] in the same range; without `lateral_colour` all fall where the middle one does."""
 
+    def at_vergences(self, vergences: Tensor) -> FieldPSFs:
+        """Of others (Z,) [1/m] in the same range."""
+
     def deviations(self, pixels: PixelGrid, *, colours: float = math.inf) -> dict[str, float]:
         """What PSFs of so many colours may be off by, of their light: pupils, sampling, outside; see
         `field.FieldEstimate`.

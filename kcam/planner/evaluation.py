@@ -24,7 +24,6 @@ from kcam.context import Context
 from kcam.effects import Skippable
 from kcam.optics import CompoundLens, Imaging, Lens
 from kcam.optics.field import ALLOWED
-from kcam.optics.imaging import is_deep
 from kcam.optics.rendering.place import Place
 from kcam.optics.source import Defocus
 from kcam.planner.light import linear
@@ -97,15 +96,13 @@ class Evaluator:
 
     @functools.cached_property
     def over_field(self) -> list[OverField] | None:
-        """What spectra tell of each sample, where optics vary over the picture as those of kcam do and nothing hides
-        anything.
-        """
-        imaging, deep = self.imaging, any(is_deep(scene) for scene in self.scenes)
+        """What spectra tell of each sample, where optics vary over the picture as those of kcam do."""
+        imaging = self.imaging
         if imaging is None or not isinstance(imaging.lens, (Lens, CompoundLens)) or not self.varies:
             return None
-        if self.gradients or deep or not linear(self.raw_camera):
+        if self.gradients or not linear(self.raw_camera):
             return None
-        return [OverField(self.raw_camera, imaging, sample) for sample in self.samples]
+        return [OverField(self.raw_camera, imaging, own, hidden=self._hideable(own)) for own in self.samples]
 
     @functools.cached_property
     def surveys(self) -> list[list[Survey]]:
@@ -245,7 +242,7 @@ class Evaluator:
     @property
     def of_lines(self) -> bool:
         """Whether the light of some scene is that of few bands, where that is known."""
-        return any(spectra.of_lines for spectra in self.spectra or ())
+        return any(spectra.of_lines for spectra in self._told)
 
     @property
     def left_out(self) -> float:
@@ -278,7 +275,7 @@ class Evaluator:
             rank = changes.get("rank")
             unseen = self._dispersion * self._left_out_by_rank(rank) if rank is not None else 0.0
             return self._dimming * max(self.lost.values(), default=1.0) * math.hypot(tried, unseen)
-        if self.spectra and changes.get("occlusion") != against.get("occlusion"):
+        if changes.get("occlusion") != against.get("occlusion"):
             return self.hiding(changes, against)
         found = [0.0]
         for sample, spectra in zip(self.samples, self._told, strict=True):
@@ -338,7 +335,7 @@ class Evaluator:
         several distances, for masks of layers may be as steep as these are.
         """
         found = [one.hidden for one in self.items]
-        for sample, spectra in zip(self.samples, self.spectra or (), strict=False):
+        for sample, spectra in zip(self.samples, self._told, strict=False):
             for owner, few in zip(sample.owners, spectra.few_lights.tolist(), strict=True):
                 if few and spectra.optics.deep:
                     found[owner] = max(found[owner], 1.0)
@@ -346,19 +343,25 @@ class Evaluator:
 
     def behind_edges(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
         """Of light that goes on behind what is nearer, how much more that is: see `Spectra`."""
-        return max((one.behind_edges(changes, against) for one in self.spectra or () if one.optics.deep), default=0.0)
+        return max((one.behind_edges(changes, against) for one in self._told if one.optics.deep), default=0.0)
 
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
         """The error of what does not hide what it should, or otherwise, tried out on the scenes with most light that
-        may be hidden; at most that light where there is hardly any.
+        may be hidden; at most that light where there is hardly any. Kept, because ladders ask again.
         """
+        key = *sorted(changes.items()), None, *sorted(against.items())
+        if key not in self._hiding:
+            self._hiding[key] = self._tried_hiding(changes, against)
+        return self._hiding[key]
+
+    def _tried_hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
         hidden = self.hidden
         found, tried, pixels = [min(light, HARDLY) for light in hidden], set(), 0
         for owner in sorted({*self.lost}, key=hidden.__getitem__, reverse=True):
             if hidden[owner] >= HARDLY and pixels < LARGEST:
                 tried.add(owner)
                 pixels += self.items[owner].recorded.numel() * TILE**2
-        for sample, spectra in zip(self.samples, self.spectra or (), strict=True):
+        for sample, spectra in zip(self.samples, self._told, strict=True):
             rows = [row for row, owner in enumerate(sample.owners) if owner in tried]
             if rows:
                 energies = torch.zeros(2, len(sample.owners), dtype=torch.float64)

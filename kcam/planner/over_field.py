@@ -22,10 +22,11 @@ from torch import Tensor
 from kcam.camera import Camera
 from kcam.optics import Imaging
 from kcam.optics.accuracy import OVER_THE_FIELD
-from kcam.optics.banks import KEPT, middle
+from kcam.optics.banks import middle
 from kcam.optics.field import PROBE, SHARED, FieldBank, nodes_apart
 from kcam.optics.numerics import lagrange_weights, linear_weights
 from kcam.optics.rendering.zones import Axis
+from kcam.optics.source import FieldPSFs
 from kcam.optics.wavelengths import chebyshev_wavelengths
 from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.light import blurred, compressed, contrast, few_lights, hues, recorded
@@ -34,11 +35,13 @@ from kcam.planner.spectra import COLOURS, WINDOW, Care, Spectra, differ
 from kcam.planner.transfers import Transfers, Way
 from kcam.scene import Scene
 
-TOLD = {"blur", "spacing", *COLOURS, *WINDOW, *OVER_THE_FIELD}
+TOLD = {"blur", "spacing", "layers", "occlusion", *COLOURS, *WINDOW, *OVER_THE_FIELD}
 """Changes of an Imaging over the field whose cost is told."""
 
 MOVES = ("distortion", "relative_illumination")
 """Of these, those that act on light before it is blurred."""
+
+_EVEN = dict.fromkeys(OVER_THE_FIELD, False)  # what hides what is tried out with one PSF all over
 
 _FEW = {"bands": FEW_BANDS}
 _OUTER = 0.29  # of a side, either part beside that in its middle: charts have edges at thirds, which a cut would hide
@@ -47,17 +50,20 @@ _MIDDLE = 0.78  # of half a side, the place that stands for its outer part: a li
 _TRIED = 2 * PROBE  # pixels between nodes, whose error tells how far apart they may be: it goes with the square
 _RADII, _POWERS = 8, 3  # places that tell how far light falls beside them, and even powers of the distance for that
 _GRID = 16  # places along a side of a picture, at which that is looked at
+_FEW_LAYERS = 3  # that tell how far apart nodes lie
+_ALONE = 4  # wavelengths that have PSFs of their own
 _COLOURS, _FEWER, _LEFT = 14, 10, 7e-3  # wavelengths of which the transfer functions of all others are polynomials,
 # where so many are off from these by so little, of usual light (RMS): beyond twice that a choice was told 0.25 times
 
 
 class OverField:
-    """A sample of scenes, as `Spectra` are: the same questions."""
+    """A sample of scenes, as `Spectra` are: the same questions; hidden: as of these."""
 
-    def __init__(self, camera: Camera, imaging: Imaging, sample: Sample) -> None:
-        self.sample, self.imaging = sample, imaging
+    def __init__(self, camera: Camera, imaging: Imaging, sample: Sample, *, hidden: Tensor | None = None) -> None:
+        self.sample, self.imaging, self.hidden = sample, imaging, hidden
         self.scene = compressed(sample.scene)
         self.weights = recorded(camera, sample.scene)
+        self.optics = _TransfersAt(imaging, self.scene, sample.picture)
         self._unlike = torch.ones(len(sample.owners), dtype=torch.float64)  # see `compare`
         self._moved_known: dict[tuple[bool, ...], Tensor] = {}
 
@@ -69,12 +75,21 @@ class OverField:
         alike: dict[Any, list[tuple[int, Scene]]] = defaultdict(list)
         for row, scene, (x, y) in self._cut():
             alike[(x, y) if self.imaging.centre else (abs(x), abs(y))].append((row, scene))  # others mirror it
-        optics, found = _TransfersAt(self.imaging, self.scene, self.sample.picture), []
+        found = []
         for place, parts in alike.items():
             rows, scenes = zip(*parts, strict=True)
-            there = optics.at(place)
-            found.append((torch.tensor(rows), Spectra(there, _together(scenes), self.weights), there))
+            there, own = self.optics.at(place), None if self.hidden is None else self.hidden[[*rows]]
+            found.append((torch.tensor(rows), self._spectra(there, _together(scenes), own), there))
         return found
+
+    def _spectra(self, optics: Transfers, scene: Scene, hidden: Tensor | None) -> Spectra:
+        """Of a part, whose layers are those of the whole."""
+        return Spectra(optics, scene, self.weights, hidden=hidden, whole=self.scene if optics.deep else None)
+
+    @functools.cached_property
+    def _whole(self) -> Spectra:
+        """All of it, with the PSFs of one place."""
+        return self._spectra(self.optics, self.scene, self.hidden)
 
     @functools.cached_property
     def _wholes(self) -> list[tuple[float, Spectra]]:
@@ -82,7 +97,7 @@ class OverField:
         each place, and the share of the sample that sees these.
         """
         sizes = [len(rows) * math.prod(spectra.scene.shape[1:]) for rows, spectra, _ in self._parts]
-        own = (Spectra(there, self.scene, self.weights) for *_, there in self._parts)
+        own = (self._spectra(there, self.scene, self.hidden) for *_, there in self._parts)
         return [(size / sum(sizes), spectra) for size, spectra in zip(sizes, own, strict=True)]
 
     def _cut(self) -> Iterator[tuple[int, Scene, tuple[float, float]]]:
@@ -122,12 +137,15 @@ class OverField:
         """Of r c(r / R), how far light falls beside the places that stand for it, c_0 + c_1 (r / R)^2 + ..., of a lens
         that is round, up to its farthest place R [pixels].
         """
-        *_, optics = self._parts[0]
         parts = torch.linspace(0, 1, _RADII + 1, dtype=torch.float64)[1:]
         places = self._axis + self._reach * torch.stack([parts, torch.zeros_like(parts)], dim=1)
-        off = optics.beside(places, self.imaging.filled(self.scene)[0][:1])
+        off = self.optics.beside(places, max(self.optics.ends.split(1), key=self._blur))
         powers = torch.arange(0, 2 * _POWERS, 2)
         return torch.linalg.lstsq(parts[:, None] ** (1 + powers), off[:, None] / self._reach).solution[:, 0]
+
+    def _blur(self, vergence: Tensor) -> float:
+        """How far light is spread from there, (1,)."""
+        return float(self.optics.defocus.radius(vergence).max())
 
     @property
     def _reach(self) -> float:
@@ -184,10 +202,10 @@ class OverField:
         return self._moved_known[moves]
 
     def _blurred(self, light: Tensor, settings: Mapping[str, Any]) -> Tensor:
-        """The energy of light (B, J, H, W) that is blurred as the first part is, (B,)."""
-        _, spectra, optics = self._parts[0]
-        vergences = spectra.imaging.filled(spectra.scene)[0][:1]
-        transfer = optics.of(optics.stage(settings), vergences, optics.wavelengths, Way.PSFS)[0].mean(1)
+        """The energy of light (B, J, H, W) that is blurred as the first part is where it is sharpest, (B,)."""
+        *_, optics = self._parts[0]
+        sharpest = min(self.imaging.spanning(self.scene).split(1), key=self._blur)
+        transfer = optics.of(optics.stage(settings), sharpest, optics.wavelengths, Way.PSFS)[0].mean(1)
         hue_by_hue = (blurred(hue, transfer, optics.frequencies, "reflect")[0] for hue in light.split(1, dim=1))
         return torch.stack(list(hue_by_hue)).sum(0)
 
@@ -196,7 +214,8 @@ class OverField:
         """About how many pixels the nodes of the reference lie apart."""
         longest = max(self.sample.picture)
         tried = min(_TRIED, longest)
-        off, all_of_it = self.energies({**_FEW, "spacing": tried}, _FEW)
+        few = _FEW | ({"layers": _FEW_LAYERS} if len(self.optics.layers) > _FEW_LAYERS else {})
+        off, all_of_it = self.energies({**few, "spacing": tried}, few)
         error = SHARED * float((off / all_of_it.clamp(min=1e-300)).max()) ** 0.5
         return min(nodes_apart(error, tried)[0], longest)
 
@@ -221,6 +240,19 @@ class OverField:
         found: list[float] = (sharp / seen.clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
         return found
 
+    def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
+        """As `Spectra.hiding`."""
+        return self._whole.hiding({**changes, **_EVEN}, {**against, **_EVEN}, rows)
+
+    def behind_edges(self, changes: Mapping[str, Any], against: Mapping[str, Any]) -> float:
+        """As `Spectra.behind_edges`."""
+        return self._whole.behind_edges(changes, against)
+
+    @property
+    def of_lines(self) -> bool:
+        """As of `Spectra`, where that counts: at edges of depth."""
+        return self.optics.deep and self._whole.of_lines
+
     @functools.cached_property
     def _light(self) -> Tensor:
         return hues(self.scene, self.weights)
@@ -241,8 +273,9 @@ class _TransfersAt(Transfers):
 
     def __init__(self, imaging: Imaging, scene: Scene, picture: tuple[int, int]) -> None:
         super().__init__(imaging, scene, picture)
+        self._among = self.layers = imaging.spanning(scene)
         self.place = 0.0, 0.0
-        self._banks: dict[Any, Tensor] = {}
+        self._psfs: dict[Any, FieldPSFs] = {}  # by vergences, wavelengths and lateral colour
 
     def at(self, place: tuple[float, float]) -> _TransfersAt:
         """The same at another place, x and y from the picture's middle [pixels]; what they know is shared."""
@@ -275,7 +308,8 @@ class _TransfersAt(Transfers):
         lateral colour is left out.
         """
         usual = imaging.accuracy.lateral_colour is self.imaging.accuracy.lateral_colour
-        if not usual or len(self.wavelengths) <= _COLOURS:
+        alone = self.deep and len(wavelengths) <= _ALONE  # of layers that are not asked for in other colours
+        if not usual or alone or len(self.wavelengths) <= _COLOURS:
             return self._at(imaging, vergences, wavelengths)
         nodes, fewer = (chebyshev_wavelengths(self.wavelengths, count)[0] for count in (_COLOURS, _FEWER))
         known = self._at(imaging, vergences, nodes)
@@ -292,28 +326,20 @@ class _TransfersAt(Transfers):
 
     def _at(self, imaging: Imaging, vergences: Tensor, nodes: Tensor) -> Tensor:
         """By the PSFs of these wavelengths: those of smaller windows are the middle of the whole."""
-        accuracy, own = imaging.accuracy, self.imaging.accuracy
-        place = self.place if accuracy.field_variation else None
-        put_back = accuracy.renormalise or own.psf_shape is None
-        key = place, *vergences.tolist(), *nodes.tolist(), accuracy.lateral_colour, put_back
-        psfs = self._banks.get(key)
-        if psfs is None:
-            whole = imaging.changed(psf_shape=own.psf_shape)
-            field = self._field(whole, vergences, nodes, self.window(whole, vergences))
-            psfs = field.bank(torch.tensor([self.place], dtype=torch.float64))[0]
-            if sum(bank.nbytes for bank in self._banks.values()) + psfs.nbytes <= KEPT:
-                self._banks[key] = psfs
+        whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape)
+        field = self._field(whole, vergences, nodes, self.window(whole, vergences))
+        psfs = field.bank(torch.tensor([self.place], dtype=torch.float64))[0]
         seen = middle(psfs, self.window(imaging, vergences))
-        if not accuracy.renormalise:
+        if not imaging.accuracy.renormalise:
             return self.slices_of(seen)
         light = psfs.sum((-2, -1)) / seen.sum((-2, -1))
         return self.slices_of(seen) * light[..., None, None].double().cpu()
 
     def _field(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> FieldBank:
-        pixels = imaging.pixels(window, self._like)
-        return imaging.field_bank(
-            self.picture, pixels, vergences=vergences, wavelengths=self.wavelengths, at=wavelengths
-        )
+        pixels, among = imaging.pixels(window, self._like), (self.layers, self.wavelengths)
+        field = imaging.field_bank(self.picture, pixels, among=among, vergences=vergences, wavelengths=wavelengths)
+        key = *vergences.tolist(), *wavelengths.tolist(), imaging.accuracy.lateral_colour
+        return replace(field, psfs=self._psfs.setdefault(key, field.psfs))  # which keep those of each place
 
     @property
     def _widest(self) -> None:
@@ -328,8 +354,8 @@ def _between(nodes: Tensor, known: Tensor, wavelengths: Tensor) -> Tensor:
 
 def _together(scenes: Sequence[Scene]) -> Scene:
     """One batch of scenes of one size."""
-    first, depths = scenes[0], [torch.as_tensor(scene.depth, dtype=torch.float64).reshape(-1) for scene in scenes]
-    depth = torch.cat(depths) if len(scenes) > 1 else first.depth
+    first, depths = scenes[0], [torch.as_tensor(scene.depth, dtype=torch.float64) for scene in scenes]
+    depth = torch.cat([own.view(-1) if own.ndim < 2 else own for own in depths]) if len(scenes) > 1 else first.depth
     return replace(first, coefficients=torch.cat([scene.coefficients for scene in scenes]), depth=depth)
 
 

@@ -104,7 +104,8 @@ class Spectra:
 
     scene: whose light may be of a few wavelengths of those that the optics are for. hidden: of each row, the energy of
     the light that something nearer may hide, of what is recorded, for each share of the pixels that is, (B,); None
-    where that does not count. hues: planes (B, J, H, W) instead of the scene's, whose squares add up.
+    where that does not count. hues: planes (B, J, H, W) instead of the scene's, whose squares add up. whole: of which
+    the scene is a part, whose layers are cut; None for the scene.
     """
 
     def __init__(
@@ -115,9 +116,10 @@ class Spectra:
         *,
         hidden: Tensor | None = None,
         hues: Tensor | None = None,
+        whole: Scene | None = None,
     ) -> None:
         self.optics, self.imaging, self.wavelengths = optics, optics.imaging, optics.wavelengths
-        self.scene, self.weights, self.hidden, self.hues = scene, weights, hidden, hues
+        self.scene, self.weights, self.hidden, self.hues, self.whole = scene, weights, hidden, hues, whole
         self.frequencies = optics.frequencies
         groups = alike(scene)
         self.groups = [(rows, scene if len(groups) == 1 else scene.samples(rows.tolist())) for rows in groups]
@@ -211,7 +213,7 @@ class Spectra:
         much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
         light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=UNSEEN)[None].to(self._light)
         grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
-        return Spectra(self.optics, grey, None, hues=hues(self.scene, self.weights))
+        return Spectra(self.optics, grey, None, hues=hues(self.scene, self.weights), whole=self.whole)
 
     @functools.cached_property
     def _coloured(self) -> Tensor:
@@ -254,7 +256,7 @@ class Spectra:
         """Even light everywhere, in the same layers: what hides what is counted in it."""
         even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
         ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
-        return Spectra(self.optics, ones, self.weights)
+        return Spectra(self.optics, ones, self.weights, whole=self.whole)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -355,7 +357,7 @@ class Spectra:
         """Masks in what is recorded of each band less that of white light, where these are unlike."""
         if not self.of_lines or not self._white_masks:
             return None
-        return Spectra(self.optics, self._masks.scene, self._less_white)
+        return Spectra(self.optics, self._masks.scene, self._less_white, whole=self.whole)
 
     @property
     def _white_masks(self) -> bool:
@@ -522,13 +524,23 @@ class Spectra:
         return self._layered[key]
 
     def _cutting(self, scene: Scene, layers: Any) -> Imaging:
-        """The stage with so many layers, or as many as light of all wavelengths asks for: a few ask for fewer."""
+        """The stage with so many layers, or as many as light of all wavelengths asks for: a few ask for fewer, and a
+        part of a scene for others than the whole.
+        """
         imaging = self.imaging if layers is None else self.imaging.changed(layers=layers)
-        if imaging.accuracy.layers is not None or not is_deep(scene) or len(scene.wavelengths) == len(self.wavelengths):
+        own = imaging.accuracy.layers is not None or len(scene.wavelengths) == len(self.wavelengths)
+        if not is_deep(scene) or (own and self.whole is None):
             return imaging
-        depth = torch.as_tensor(scene.depth, dtype=torch.float64)
-        vergences = imaging.vergences(scene, depth, wavelengths=self.wavelengths)
-        return imaging.changed(layers=tuple((1 / vergences).tolist()))
+        return imaging.changed(layers=tuple((1 / self._cut(scene, imaging)).tolist()))
+
+    def _cut(self, scene: Scene, imaging: Imaging) -> Tensor:
+        """Vergences of the layers that a stage cuts a scene into, or the whole of which it is a part, in light of all
+        wavelengths, (Z,).
+        """
+        scene = scene if self.whole is None else self.whole
+        return imaging.vergences(
+            scene, torch.as_tensor(scene.depth, dtype=torch.float64), wavelengths=self.wavelengths
+        ).cpu()
 
     def _once(
         self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], way: Way
@@ -543,7 +555,7 @@ class Spectra:
 
     def _between(self, scene: Scene, vergences: Tensor, imaging: Imaging) -> tuple[Tensor, Tensor]:
         """Vergences (Y,) of the layers of a stage, and what each of others, (Z,), takes from these, (Z, Y)."""
-        own = imaging.vergences(scene, torch.as_tensor(scene.depth, dtype=torch.float64)).cpu()
+        own = self._cut(scene, imaging)
         if len(own) == 1:
             return own, torch.ones(len(vergences), 1, dtype=torch.float64)
         shares = layer_shares(vergences.cpu()[None, None, None], own, interpolate=imaging.accuracy.interpolate)[0, :, 0]

@@ -99,6 +99,7 @@ class Transfers:
         self._like = imaging.working(scene)[:, :0]
         vergences = (1 / torch.as_tensor(scene.depth, dtype=torch.float64)).flatten().cpu()
         self.ends = torch.stack([vergences.min(), vergences.max()])  # the farthest and the nearest
+        self._among: Tensor | None = None  # see `Imaging.psf_window`
         self._stages: dict[Any, Imaging] = {}  # by changes
         self._tabled: dict[Any, bool] = {}  # by propagator
         self._windows: dict[Any, tuple[int, int]] = {}  # by what a stage says of them, and vergences
@@ -246,7 +247,9 @@ class Transfers:
         """Of the PSFs of a stage [pixels]."""
         key = imaging.accuracy.blur, imaging.accuracy.psf_shape, *vergences.tolist()
         if key not in self._windows:
-            self._windows[key] = imaging.psf_window(self.wavelengths, vergences=vergences, picture=self.picture)
+            self._windows[key] = imaging.psf_window(
+                self.wavelengths, vergences=vergences, picture=self.picture, among=self._among
+            )
         return self._windows[key]
 
     @functools.cached_property

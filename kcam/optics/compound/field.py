@@ -58,16 +58,20 @@ class FieldPSFs:
     lateral_colour: bool = True
     middle: Tensor | None = None  # wavelength whose light illuminates [m], () of those that were traced
     illuminates: Even | None = None  # which takes as long to know as a PSF
-    windows: dict[float, tuple[int, int]] = field(default_factory=dict, repr=False)  # by pitch
-    units: dict[tuple[float, ...], Tensor] = field(default_factory=dict, repr=False)  # without graphs, by wavelengths
+    spreads: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
+    units: dict[tuple[float, ...], Tensor] = field(default_factory=dict, repr=False)
+    # without graphs, by vergences and wavelengths, for all that are traced
 
     def at_wavelengths(self, wavelengths: Tensor, *, lateral_colour: bool = True) -> FieldPSFs:
         """Of others (L,) [m] in the same range; see `source.FieldPSFs`. They illuminate alike."""
         known = None if torch.is_grad_enabled() else self._illumination
         own = wavelengths.to("cpu", torch.float64)
-        return replace(
-            self, wavelengths=own, lateral_colour=lateral_colour, middle=self._middle, illuminates=known, windows={}
-        )
+        return replace(self, wavelengths=own, lateral_colour=lateral_colour, middle=self._middle, illuminates=known)
+
+    def at_vergences(self, vergences: Tensor) -> FieldPSFs:
+        """Of others (Z,) [1/m] in the same range; they illuminate alike."""
+        known = None if torch.is_grad_enabled() else self._illumination
+        return replace(self, vergences=vergences.to("cpu", torch.float64), illuminates=known)
 
     @property
     def _middle(self) -> Tensor:
@@ -127,7 +131,7 @@ class FieldPSFs:
 
     def _on_axis(self, wavelengths: Tensor) -> Tensor:
         """Light of points on the axis, (Z, L), kept."""
-        key = (*wavelengths.tolist(),)
+        key = *self.vergences.tolist(), *wavelengths.tolist()
         if key not in self.units:
             fitted = self._fitted(wavelengths[:0], wavelengths)
             nodes = torch.arange(len(fitted.centre)).view(-1, len(wavelengths))
@@ -192,16 +196,12 @@ class FieldPSFs:
 
     @torch.no_grad()
     def window(self, pixels: PixelGrid) -> tuple[int, int]:
-        """The window that holds all but `OUTSIDE` of the light of any height in the table.
+        """The window that holds all but `OUTSIDE` of the light of any height in the table, from the farthest and the
+        nearest: what lies between is less out of focus than one of them.
 
         A rim of length P around an area A sends the share lambda d P / (2 pi^2 A r) beyond a radius r, see
         `Lens.window`; of each ray that falls x from the middle, what lies beyond r - x.
         """
-        if pixels.pitch not in self.windows:
-            self.windows[pixels.pitch] = self._window(pixels)
-        return self.windows[pixels.pitch]
-
-    def _window(self, pixels: PixelGrid) -> tuple[int, int]:
         slopes, area = self._spread
         colours = self._looked.repeat(len(slopes) // len(self._looked))
         # the rim of an area is that of a disc at least: 2 sqrt(pi area)
@@ -215,9 +215,16 @@ class FieldPSFs:
         index = torch.linspace(0, len(self.wavelengths) - 1, min(_COLOURS, len(self.wavelengths))).round().long()
         return self.wavelengths.sort().values[index]
 
-    @functools.cached_property
+    @property
     def _spread(self) -> tuple[Tensor, Tensor]:
         """How far shares of the light of some nodes fall from where they should [m], and the areas of their pupils."""
+        ends = torch.stack([*self.vergences.aminmax()]).unique()
+        key = *ends.tolist(), *self._looked.tolist()
+        if key not in self.spreads:
+            self.spreads[key] = replace(self, vergences=ends)._spread_of_all()
+        return self.spreads[key]
+
+    def _spread_of_all(self) -> tuple[Tensor, Tensor]:
         radii = torch.linspace(0, self.reach, _LOOKED if self.reach else 1, dtype=torch.float64)
         fitted = self._fitted(radii, self._looked)
         frame = Frame.upright(fitted)

@@ -82,6 +82,10 @@ class ThinFieldPSFs:
         """Of others (L,) [m]; chief rays of all wavelengths fall together, with lateral colour or without."""
         return replace(self, query=replace(self.query, wavelengths=wavelengths.to(self.query.wavelengths)))
 
+    def at_vergences(self, vergences: Tensor) -> ThinFieldPSFs:
+        """Of others (Z,) [1/m]."""
+        return replace(self, query=replace(self.query, points=Points(vergences.to(self.query.vergences))))
+
     def undistorted(self, places: Tensor) -> Tensor:
         """The places: chief rays go straight on."""
         return places
