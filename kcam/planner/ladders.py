@@ -494,7 +494,7 @@ def _support(view: _View) -> Iterator[Ladder]:
     # behind maps line spreads told rescaled ones to cost 0.3 to 1.2 times what they do
     alternatives = None if pixels or over_field else rescaled
     ladder = Ladder("PSF support", levels, beside, alternatives=alternatives, from_top=view.evaluator.certain)
-    ladder.doubtful = view.one and not (tabled or pixels)  # for what takes PSFs
+    ladder.doubtful = view.one and not (tabled or pixels or over_field)  # for what takes PSFs of its own
     if pixels:
         ladder.off_by, ladder.rough, ladder.little = BY_LINES_OF_PIXELS, Care.AT_FIRST, math.inf
     elif by_lines and view.imaging.fill_factor == 1:  # else lines do not tell what colours of aliases cost

@@ -79,8 +79,8 @@ def shoot(
     camera: Camera, scene: Scene, *, tolerance: float | str, generator: torch.Generator | None = None
 ) -> tuple[torch.Tensor, Plan]:
     """One picture within a tolerance, and the plan for it, made and used where that pays: with the PSFs that making it
-    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and where choices are tried out,
-    of optics that vary over the picture with a map of depth.
+    took. It is the reference where all of that takes less than a plan: up to `WORTH`, and over the field where choices
+    are tried out.
 
     Arguments and errors: as `make_plan`, and as `Camera`.
 
@@ -92,7 +92,7 @@ def shoot(
     """
     check_tolerance(tolerance)
     planner = Planner(camera, scene, one=True)
-    plan = planner.plan(tolerance if planner.pays else 0)
+    plan = planner.plan(tolerance if planner.pays(tolerance) else 0)
     stages = list(camera)
     if plan.changes and planner.evaluator.index is not None and planner.evaluator.imaging is not None:
         stages[planner.evaluator.index] = planner.evaluator.imaging.knowing_enough()
@@ -128,8 +128,7 @@ class Planner:
         self._known: tuple[list[Ladder], list[Skip]] | None = None
         self._setup = time.perf_counter() - start
 
-    @property
-    def pays(self) -> bool:
+    def pays(self, tolerance: float | str) -> bool:
         """Whether a plan for a single picture takes less time than it saves: see `shoot`."""
         scene, imaging = self.prices.scene, self.evaluator.imaging
         if imaging is None or not scene.coefficients.numel():
@@ -141,7 +140,12 @@ class Planner:
         usual = self.prices.rates | costs.RATES  # on a slower machine a plan takes longer, too
         if costs.seconds(self.prices.work({}), usual) <= worth * (1 + scene.shape[0] / 8):
             return False
-        return not varies or self.evaluator.over_field is not None  # which takes a look at the scene
+        if not varies:
+            return True
+        if self.evaluator.over_field is None or self.evaluator.few_lights:  # which takes a look at the scene
+            return False
+        self._ways()  # which looks at what the sensor is given
+        return self.evaluator.foretells(self.evaluator.noise() if isinstance(tolerance, str) else tolerance)
 
     @no_more_than_free()
     @unchanged()

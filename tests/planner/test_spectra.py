@@ -228,7 +228,7 @@ def test_whether_a_plan_pays_is_the_same_on_a_slower_machine(seed: int, monkeypa
         rates = {kind: slower * rate for kind, rate in costs.RATES.items()}
         monkeypatch.setattr(costs, "current_rates", lambda _, rates=rates: rates)
         planner = Planner(camera, scene, one=True)
-        told.append((planner.pays, planner.prices.of({})[0] / slower))
+        told.append((planner.pays(0.01), planner.prices.of({})[0] / slower))
     assert len({pays for pays, _ in told}) == 1
     assert max(seconds for _, seconds in told) == pytest.approx(min(seconds for _, seconds in told))
 
