@@ -32,7 +32,7 @@ from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.light import blurred, compressed, contrast, few_lights, hues, recorded
 from kcam.planner.samples import Sample
 from kcam.planner.spectra import COLOURS, WINDOW, Care, Spectra, differ
-from kcam.planner.transfers import Transfers, Way
+from kcam.planner.transfers import CUT, Transfers, Way
 from kcam.scene import Scene
 
 TOLD = {"blur", "spacing", "layers", "occlusion", *COLOURS, *WINDOW, *OVER_THE_FIELD}
@@ -289,6 +289,17 @@ class _TransfersAt(Transfers):
         rows = field.bank(places).double().sum((1, 2, 3)).cpu()
         return rows @ (torch.arange(rows.shape[1]) - rows.shape[1] // 2).double() / rows.sum(1)
 
+    @functools.cached_property
+    def fits(self) -> bool:
+        """As of `Transfers`: a window as large as the picture may cut rays off."""
+        sides = zip(self.window(self.imaging, self.ends.unique()), self.picture, strict=True)
+        return self.imaging.accuracy.psf_shape is not None or all(m < n for m, n in sides)
+
+    @functools.cached_property
+    def corners(self) -> float:
+        """As of `Transfers`."""
+        return 1.0 if self.fits else CUT
+
     def slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
         """By PSFs there, and what they are off by between nodes."""
         accuracy, window = imaging.accuracy, self.window(imaging, vergences)
@@ -326,10 +337,11 @@ class _TransfersAt(Transfers):
 
     def _at(self, imaging: Imaging, vergences: Tensor, nodes: Tensor) -> Tensor:
         """By the PSFs of these wavelengths: those of smaller windows are the middle of the whole."""
-        whole = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape)
-        field = self._field(whole, vergences, nodes, self.window(whole, vergences))
+        whole, window = imaging.changed(psf_shape=self.imaging.accuracy.psf_shape), self.window(imaging, vergences)
+        height, width = map(max, self.window(whole, vergences), window)  # what is in focus may have a smaller one
+        field = self._field(whole, vergences, nodes, (height, width))
         psfs = field.bank(torch.tensor([self.place], dtype=torch.float64))[0]
-        seen = middle(psfs, self.window(imaging, vergences))
+        seen = middle(psfs, window)
         if not imaging.accuracy.renormalise:
             return self.slices_of(seen)
         light = psfs.sum((-2, -1)) / seen.sum((-2, -1))
