@@ -594,11 +594,14 @@ class Imaging(Stage):
         return FieldPicture(psfs, self.pixels(window, like), self._middle, self.accuracy, mixing, renderer)
 
     def spanning(self, scene: Scene) -> Tensor:
-        """Vergences of the layers of a scene, (Z,) [1/m], as many as the rule says: those for which a real lens is
-        traced that is asked for others, too.
+        """Vergences of the layers of a scene, (Z,) [1/m], as many as the rule says, and at distances that were given:
+        those for which a real lens is traced that is asked for others, too.
         """
-        own = self.changed(layers=None) if is_deep(scene) and self.accuracy.layers is not None else self
-        return own.vergences(scene, torch.as_tensor(scene.depth, dtype=torch.float64))
+        depth, layers = torch.as_tensor(scene.depth, dtype=torch.float64), self.accuracy.layers
+        if layers is None or not is_deep(scene):
+            return self.vergences(scene, depth)
+        found = self.changed(layers=None).vergences(scene, depth)
+        return found if isinstance(layers, int) else torch.cat([found, self.vergences(scene, depth)]).unique()
 
     def field_bank(
         self,

@@ -2,9 +2,9 @@
 
     E^2 = sum_p E_p^2,   E_p by the spectra of what stands in a part, and transfer functions in its middle
 
-Windows cost what they do to waves longer than parts, too: of the whole, with the PSFs of each place. What moves light
-(distortion), or dims it smoothly, is told by the light that it moves; and where PSFs bring light beside their places,
-it is spread over more or less of the sensor than by one PSF.
+Layers of depth lie in each part where they lie in the whole. Windows cost what they do to waves longer than parts, too:
+of the whole, with the PSFs of each place. What moves light (distortion), or dims it smoothly, is told by the light that
+it moves; and where PSFs bring light beside their places, it is spread over more or less of the sensor than by one PSF.
 """
 
 from __future__ import annotations
