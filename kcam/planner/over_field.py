@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -51,6 +52,7 @@ _TRIED = 2 * PROBE  # pixels between nodes, whose error tells how far apart they
 _RADII, _POWERS = 8, 3  # places that tell how far light falls beside them, and even powers of the distance for that
 _GRID = 16  # places along a side of a picture, at which that is looked at
 _FEW_LAYERS = 3  # that tell how far apart nodes lie
+_HELD = 0.9  # of the light, that a window holds which cuts nothing but diffraction off
 _ALONE = 4  # wavelengths that have PSFs of their own
 _COLOURS, _FEWER, _LEFT = 14, 10, 7e-3  # wavelengths of which the transfer functions of all others are polynomials,
 # where so many are off from these by so little, of usual light (RMS): beyond twice that a choice was told 0.25 times
@@ -290,15 +292,15 @@ class _TransfersAt(Transfers):
         return rows @ (torch.arange(rows.shape[1]) - rows.shape[1] // 2).double() / rows.sum(1)
 
     @functools.cached_property
-    def fits(self) -> bool:
-        """As of `Transfers`: a window as large as the picture may cut rays off."""
-        sides = zip(self.window(self.imaging, self.ends.unique()), self.picture, strict=True)
-        return self.imaging.accuracy.psf_shape is not None or all(m < n for m, n in sides)
-
-    @functools.cached_property
     def corners(self) -> float:
-        """As of `Transfers`."""
-        return 1.0 if self.fits else CUT
+        """As of `Transfers`, of a window as large as the picture that cuts more off than diffraction."""
+        ends = self.ends.unique()
+        window = self.window(self.imaging, ends)
+        if self.imaging.accuracy.psf_shape is not None or all(map(operator.lt, window, self.picture)):
+            return 1.0
+        seen = self._field(self.imaging.changed(psf_shape=window), ends, self.few, window)
+        light = seen.bank(torch.tensor([self.place], dtype=torch.float64)).sum((-2, -1))
+        return CUT if float(light.min()) < _HELD else 1.0
 
     def slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
         """By PSFs there, and what they are off by between nodes."""
