@@ -141,8 +141,7 @@ class Banks:
         if missing := [row for row, key in enumerate(keys) if key not in found]:
             psfs = self._compute(own[missing] * grain, odd, whole=whole, mixing=mixing, colours=colours)
             found |= zip((keys[row] for row in missing), psfs, strict=True)
-            held = sum(psf.nbytes for psf in self.kept.values())
-            if not psfs.requires_grad and held + psfs.nbytes <= KEPT:
+            if not psfs.requires_grad and self.held + psfs.nbytes <= KEPT:
                 self.kept.update(found)
         return torch.stack([self._turned(found[keys[row]], place) for row, place in zip(which, places, strict=True)])[
             ..., :height, :width
@@ -152,6 +151,11 @@ class Banks:
         """That of a place with positive x and y, as it is at one that mirrors it."""
         turned = [axis for axis, side in zip((-1, -2), place.tolist(), strict=True) if self.mirrored and side < 0]
         return psf.flip(turned) if turned else psf
+
+    @property
+    def held(self) -> int:
+        """Bytes of the PSFs that are kept."""
+        return sum(psf.nbytes for psf in [*self.kept.values()])
 
     @property
     def fewer(self) -> tuple[int, ...]:

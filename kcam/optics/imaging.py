@@ -283,11 +283,10 @@ class Imaging(Stage):
             return self.accuracy.psf_shape
         pixels = self.pixels((1, 1), torch.empty(0))
         if self.varies:
-            traced = self._traced(picture, vergences if among is None else among, wavelengths)
-            own = traced if among is None else traced.at_vergences(vergences)
-            reach = self.reach(picture) if self._reach is None else self._reach
-            key = self.lens, reach, vergences, wavelengths, pixels
-            return _within(self._window_cache.get(key, lambda: own.window(pixels)), picture)
+            among = vergences if among is None else among
+            find = self._traced(picture, among, wavelengths).at_vergences(vergences).window
+            key = self.lens, self._corner(picture), among, vergences, wavelengths, self.psf_wavelengths(wavelengths)
+            return _within(self._window_cache.get((*key, pixels), lambda: find(pixels)), picture)
         find = functools.partial(self.lens.window, Points(vergences), wavelengths, pixels)
         if self.known is not None:
             return _within(self.known.window(vergences, wavelengths, pixels, find), picture)
@@ -551,6 +550,10 @@ class Imaging(Stage):
         half = (self.pixel_pitch * n / 2 for n in picture[::-1])
         return math.hypot(*(abs(c) + side for c, side in zip(self._middle, half, strict=True)))
 
+    def _corner(self, picture: tuple[int, int]) -> float:
+        """How far the whole of which this is the picture, or a part, goes from the axis [m]."""
+        return self.reach(picture) if self._reach is None else self._reach
+
     def part(self, place: tuple[float, float], *, reach: float) -> Imaging:
         """The same stage for a part of its picture, whose middle lies at `place`, x and y from that of the picture,
         upright [pixels]; reach: of the whole picture [m].
@@ -565,18 +568,19 @@ class Imaging(Stage):
     ) -> FieldPSFs:
         """PSFs of all places of a picture, traced once for all ways to group the wavelengths."""
         grouped, lateral = self.psf_wavelengths(wavelengths), self.accuracy.lateral_colour
-        corner = self.reach(picture) if self._reach is None else self._reach
 
         def build() -> FieldPSFs:
             found = self._traced(picture, vergences, wavelengths) if traced is None else traced
             return found.at_wavelengths(grouped, lateral_colour=lateral)
 
-        return self._field_cache.get((self.lens, corner, vergences, wavelengths, grouped, lateral), build)
+        return self._field_cache.get(
+            (self.lens, self._corner(picture), vergences, wavelengths, grouped, lateral), build
+        )
 
     def _traced(self, picture: tuple[int, int], vergences: Tensor, wavelengths: Tensor) -> FieldPSFs:
         """Those of all wavelengths, which the groups of any number take theirs from."""
         lens: Any = self.lens  # which `varies` has made sure of
-        corner = self.reach(picture) if self._reach is None else self._reach
+        corner = self._corner(picture)
         own = wavelengths if len(wavelengths) > _FEW_TRACED else self.psf_wavelengths(wavelengths)
         return self._traced_cache.get(
             (self.lens, corner, vergences, own), lambda: lens.over_field(corner, vergences, own)
@@ -597,31 +601,31 @@ class Imaging(Stage):
         """Vergences of the layers of a scene, (Z,) [1/m], as many as the rule says, and at distances that were given:
         those for which a real lens is traced that is asked for others, too.
         """
-        depth, layers = torch.as_tensor(scene.depth, dtype=torch.float64), self.accuracy.layers
+        depth = torch.as_tensor(scene.depth, dtype=torch.float64, device=scene.coefficients.device)
+        layers = self.accuracy.layers
         if layers is None or not is_deep(scene):
             return self.vergences(scene, depth)
         found = self.changed(layers=None).vergences(scene, depth)
         return found if isinstance(layers, int) else torch.cat([found, self.vergences(scene, depth)]).unique()
 
-    def field_bank(
-        self,
-        picture: tuple[int, int],
-        pixels: PixelGrid,
-        *,
-        among: tuple[Tensor, Tensor],
-        vergences: Tensor,
-        wavelengths: Tensor,
-    ) -> FieldBank:
-        """PSFs of places of a picture (H, W), of layers (Z,) [1/m] and wavelengths (G,) [m], in the range of those
-        `among` which they are, of the scene.
+    def field_psfs(
+        self, picture: tuple[int, int], traced: tuple[Tensor, Tensor], *, vergences: Tensor, wavelengths: Tensor
+    ) -> FieldPSFs:
+        """PSFs of places of a picture (H, W), of layers (Z,) [1/m] and wavelengths (G,) [m]: in the ranges of the
+        vergences and wavelengths for which the lens is `traced`.
         """
-        traced = self._traced(picture, *among).at_vergences(vergences)
-        psfs = traced.at_wavelengths(wavelengths, lateral_colour=self.accuracy.lateral_colour)
+        found = self._traced(picture, *traced).at_vergences(vergences)
+        return found.at_wavelengths(wavelengths, lateral_colour=self.accuracy.lateral_colour)
+
+    def field_bank(self, psfs: FieldPSFs, pixels: PixelGrid) -> FieldBank:
+        """These as this stage takes them."""
         return FieldBank(psfs, pixels, self._middle, self.accuracy, None)
 
-    def moved(self, scene: Scene, planes: Tensor) -> Tensor:
-        """Planes (B, J, H, W) over a scene, as distortion and relative illumination bring them to the picture."""
-        field = self._field_picture(scene, vergences=self.spanning(scene), weights=None, like=planes)
+    def moved(self, scene: Scene, planes: Tensor, *, vergences: Tensor) -> Tensor:
+        """Planes (B, J, H, W) over a scene, as distortion and relative illumination bring them to the picture;
+        vergences: (Z,) [1/m], for which the lens is traced.
+        """
+        field = self._field_picture(scene, vergences=vergences, weights=None, like=planes)
         return field.moved(planes, None)[0]
 
     @no_more_than_free()

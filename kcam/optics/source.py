@@ -148,6 +148,10 @@ class FieldPSFs(Protocol):
         """How many wavelengths may stand for all, ascending."""
 
     @property
+    def held(self) -> int:
+        """Bytes of the PSFs that are kept."""
+
+    @property
     def mirrored(self) -> bool:
         """Whether PSFs of places that mirror each other in x or y do so too."""
 

@@ -39,6 +39,7 @@ from kcam.sensor.random_stage import RandomStage
 LARGEST = 320**2  # pixels that are tried whole, of a scene and of the items of a batch
 CROP = 160  # side of the crops of larger scenes, beside what blur reaches [pixels]
 WITNESSED = 2**20  # pixels of the last trial
+UNTOLD = 2 * ALLOWED  # error over the field, below which it is not told: near what the reference may be off by
 NOTHING: Shortcuts = {}
 CUT = 1.01  # RMS of light over that of what the full well leaves of it, from which on that matters
 LOOKED = 129  # side of the PSFs with which the light is looked at, where these hold most of it: wide ones take long
@@ -227,7 +228,7 @@ class Evaluator:
         """Whether what choices cost is known so well that no last trial is needed: over the field not of a few lights,
         nor near what the reference itself may be off by.
         """
-        return self.certain and (self.over_field is None or (allowed >= 2 * ALLOWED and not self.few_lights))
+        return self.certain and (self.over_field is None or (allowed >= UNTOLD and not self.few_lights))
 
     @property
     def _told(self) -> Sequence[Spectra | OverField]:

@@ -23,7 +23,7 @@ from torch import Tensor
 from kcam.camera import Camera
 from kcam.optics import Imaging
 from kcam.optics.accuracy import OVER_THE_FIELD
-from kcam.optics.banks import middle
+from kcam.optics.banks import KEPT, middle
 from kcam.optics.field import PROBE, SHARED, FieldBank, nodes_apart
 from kcam.optics.numerics import lagrange_weights, linear_weights
 from kcam.optics.rendering.zones import Axis
@@ -33,7 +33,7 @@ from kcam.planner.band_counts import FEW_BANDS
 from kcam.planner.light import blurred, compressed, contrast, few_lights, hues, recorded
 from kcam.planner.samples import Sample
 from kcam.planner.spectra import COLOURS, WINDOW, Care, Spectra, differ
-from kcam.planner.transfers import CUT, Transfers, Way
+from kcam.planner.transfers import CUT_COLOURS, Transfers, Way
 from kcam.scene import Scene
 
 TOLD = {"blur", "spacing", "layers", "occlusion", *COLOURS, *WINDOW, *OVER_THE_FIELD}
@@ -81,17 +81,13 @@ class OverField:
         for place, parts in alike.items():
             rows, scenes = zip(*parts, strict=True)
             there, own = self.optics.at(place), None if self.hidden is None else self.hidden[[*rows]]
-            found.append((torch.tensor(rows), self._spectra(there, _together(scenes), own), there))
+            found.append((torch.tensor(rows), Spectra(there, _together(scenes), self.weights, hidden=own), there))
         return found
-
-    def _spectra(self, optics: Transfers, scene: Scene, hidden: Tensor | None) -> Spectra:
-        """Of a part, whose layers are those of the whole."""
-        return Spectra(optics, scene, self.weights, hidden=hidden, whole=self.scene if optics.deep else None)
 
     @functools.cached_property
     def _whole(self) -> Spectra:
         """All of it, with the PSFs of one place."""
-        return self._spectra(self.optics, self.scene, self.hidden)
+        return Spectra(self.optics, self.scene, self.weights, hidden=self.hidden)
 
     @functools.cached_property
     def _wholes(self) -> list[tuple[float, Spectra]]:
@@ -99,7 +95,7 @@ class OverField:
         each place, and the share of the sample that sees these.
         """
         sizes = [len(rows) * math.prod(spectra.scene.shape[1:]) for rows, spectra, _ in self._parts]
-        own = (self._spectra(there, self.scene, self.hidden) for *_, there in self._parts)
+        own = (self._whole.through(there) for *_, there in self._parts)
         return [(size / sum(sizes), spectra) for size, spectra in zip(sizes, own, strict=True)]
 
     def _cut(self) -> Iterator[tuple[int, Scene, tuple[float, float]]]:
@@ -113,6 +109,7 @@ class OverField:
             for (top, height, y), (left, width, x) in ((one, other) for one in rows for other in columns):
                 yield row, scene.crop(top=top, left=left, height=height, width=width), (x, y)
 
+    @torch.no_grad()
     def energies(
         self, changes: Mapping[str, Any], against: Mapping[str, Any], care: Care = Care.FULL
     ) -> tuple[Tensor, Tensor]:
@@ -194,19 +191,23 @@ class OverField:
             planes, sample = self._light, self.sample
             own = self.imaging.changed(**dict(zip(MOVES, moves, strict=True)))
             if any(moves) and sample.places is None:
-                planes = own.moved(self.scene, planes)
+                planes = own.moved(self.scene, planes, vergences=self.optics.layers)
             elif any(moves):
                 reach = own.reach(sample.picture)
                 parts = [own.part(place, reach=reach) for place in sample.places or ()]
                 rows = zip(parts, planes.split(1), strict=True)
-                planes = torch.cat([part.moved(self.scene.samples([k]), one) for k, (part, one) in enumerate(rows)])
+                found = (
+                    part.moved(self.scene.samples([k]), one, vergences=self.optics.layers)
+                    for k, (part, one) in enumerate(rows)
+                )
+                planes = torch.cat([*found])
             self._moved_known[moves] = planes
         return self._moved_known[moves]
 
     def _blurred(self, light: Tensor, settings: Mapping[str, Any]) -> Tensor:
         """The energy of light (B, J, H, W) that is blurred as the first part is where it is sharpest, (B,)."""
         *_, optics = self._parts[0]
-        sharpest = min(self.imaging.spanning(self.scene).split(1), key=self._blur)
+        sharpest = min(optics.layers.split(1), key=self._blur)
         transfer = optics.of(optics.stage(settings), sharpest, optics.wavelengths, Way.PSFS)[0].mean(1)
         hue_by_hue = (blurred(hue, transfer, optics.frequencies, "reflect")[0] for hue in light.split(1, dim=1))
         return torch.stack(list(hue_by_hue)).sum(0)
@@ -242,6 +243,7 @@ class OverField:
         found: list[float] = (sharp / seen.clamp(min=1e-300)).sqrt().clamp(min=1).tolist()
         return found
 
+    @torch.no_grad()
     def hiding(self, changes: Mapping[str, Any], against: Mapping[str, Any], rows: list[int]) -> tuple[Tensor, Tensor]:
         """As `Spectra.hiding`."""
         return self._whole.hiding({**changes, **_EVEN}, {**against, **_EVEN}, rows)
@@ -276,14 +278,24 @@ class _TransfersAt(Transfers):
     def __init__(self, imaging: Imaging, scene: Scene, picture: tuple[int, int]) -> None:
         super().__init__(imaging, scene, picture)
         self._among = self.layers = imaging.spanning(scene)
-        self.place = 0.0, 0.0
+        self.place, self._scene = (0.0, 0.0), scene
+        self._cuts: dict[str, Tensor] = {}  # by what a stage says of them
         self._psfs: dict[Any, FieldPSFs] = {}  # by vergences, wavelengths and lateral colour
 
     def at(self, place: tuple[float, float]) -> _TransfersAt:
         """The same at another place, x and y from the picture's middle [pixels]; what they know is shared."""
         own = type(self).__new__(type(self))
         vars(own).update(vars(self), place=place)
+        vars(own).pop("corners_of_colours", None)  # which differ
         return own
+
+    def cut(self, imaging: Imaging) -> Tensor | None:
+        """As of `Transfers`; kept, because all parts ask."""
+        key = str((imaging.accuracy.layers, imaging.accuracy.blur))
+        if self.deep and key not in self._cuts:
+            depth = torch.as_tensor(self._scene.depth, dtype=torch.float64)
+            self._cuts[key] = imaging.vergences(self._scene, depth, wavelengths=self.wavelengths).cpu()
+        return self._cuts.get(key)
 
     def beside(self, places: Tensor, vergences: Tensor) -> Tensor:
         """How far light of places (N, 2) falls beside them along x, (N,) [pixels]."""
@@ -292,7 +304,7 @@ class _TransfersAt(Transfers):
         return rows @ (torch.arange(rows.shape[1]) - rows.shape[1] // 2).double() / rows.sum(1)
 
     @functools.cached_property
-    def corners(self) -> float:
+    def corners_of_colours(self) -> float:
         """As of `Transfers`, of a window as large as the picture that cuts more off than diffraction."""
         ends = self.ends.unique()
         window = self.window(self.imaging, ends)
@@ -300,7 +312,7 @@ class _TransfersAt(Transfers):
             return 1.0
         seen = self._field(self.imaging.changed(psf_shape=window), ends, self.few, window)
         light = seen.bank(torch.tensor([self.place], dtype=torch.float64)).sum((-2, -1))
-        return CUT if float(light.min()) < _HELD else 1.0
+        return CUT_COLOURS if float(light.min()) < _HELD else 1.0
 
     def slices(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, way: Way, *, grey: bool) -> Tensor:
         """By PSFs there, and what they are off by between nodes."""
@@ -350,10 +362,13 @@ class _TransfersAt(Transfers):
         return self.slices_of(seen) * light[..., None, None].double().cpu()
 
     def _field(self, imaging: Imaging, vergences: Tensor, wavelengths: Tensor, window: tuple[int, int]) -> FieldBank:
-        pixels, among = imaging.pixels(window, self._like), (self.layers, self.wavelengths)
-        field = imaging.field_bank(self.picture, pixels, among=among, vergences=vergences, wavelengths=wavelengths)
         key = *vergences.tolist(), *wavelengths.tolist(), imaging.accuracy.lateral_colour
-        return replace(field, psfs=self._psfs.setdefault(key, field.psfs))  # which keep those of each place
+        if key not in self._psfs:  # which keep those of each place
+            while sum(psfs.held for psfs in self._psfs.values()) > KEPT:
+                del self._psfs[next(iter(self._psfs))]
+            traced = self.layers, self.wavelengths
+            self._psfs[key] = imaging.field_psfs(self.picture, traced, vergences=vergences, wavelengths=wavelengths)
+        return imaging.field_bank(self._psfs[key], imaging.pixels(window, self._like))
 
     @property
     def _widest(self) -> None:

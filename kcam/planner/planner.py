@@ -19,7 +19,7 @@ from kcam.optics import Imaging
 from kcam.optics.accuracy import check_memory
 from kcam.optics.imaging import is_deep
 from kcam.planner import costs
-from kcam.planner.evaluation import Evaluator
+from kcam.planner.evaluation import UNTOLD, Evaluator
 from kcam.planner.ladder import Ladder
 from kcam.planner.ladders import ladders
 from kcam.planner.light import FEW, lights
@@ -128,8 +128,16 @@ class Planner:
         self._known: tuple[list[Ladder], list[Skip]] | None = None
         self._setup = time.perf_counter() - start
 
+    @no_more_than_free()
+    @unchanged()
     def pays(self, tolerance: float | str) -> bool:
         """Whether a plan for a single picture takes less time than it saves: see `shoot`."""
+        start = time.perf_counter()
+        pays = self._pays(tolerance)
+        self._setup += time.perf_counter() - start
+        return pays
+
+    def _pays(self, tolerance: float | str) -> bool:
         scene, imaging = self.prices.scene, self.evaluator.imaging
         if imaging is None or not scene.coefficients.numel():
             return False
@@ -142,6 +150,8 @@ class Planner:
             return False
         if not varies:
             return True
+        if not isinstance(tolerance, str) and tolerance < UNTOLD:
+            return False
         if self.evaluator.over_field is None or self.evaluator.few_lights:  # which takes a look at the scene
             return False
         self._ways()  # which looks at what the sensor is given

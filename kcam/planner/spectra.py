@@ -104,8 +104,7 @@ class Spectra:
 
     scene: whose light may be of a few wavelengths of those that the optics are for. hidden: of each row, the energy of
     the light that something nearer may hide, of what is recorded, for each share of the pixels that is, (B,); None
-    where that does not count. hues: planes (B, J, H, W) instead of the scene's, whose squares add up. whole: of which
-    the scene is a part, whose layers are cut; None for the scene.
+    where that does not count. hues: planes (B, J, H, W) instead of the scene's, whose squares add up.
     """
 
     def __init__(
@@ -116,10 +115,9 @@ class Spectra:
         *,
         hidden: Tensor | None = None,
         hues: Tensor | None = None,
-        whole: Scene | None = None,
     ) -> None:
         self.optics, self.imaging, self.wavelengths = optics, optics.imaging, optics.wavelengths
-        self.scene, self.weights, self.hidden, self.hues, self.whole = scene, weights, hidden, hues, whole
+        self.scene, self.weights, self.hidden, self.hues = scene, weights, hidden, hues
         self.frequencies = optics.frequencies
         groups = alike(scene)
         self.groups = [(rows, scene if len(groups) == 1 else scene.samples(rows.tolist())) for rows in groups]
@@ -136,6 +134,12 @@ class Spectra:
         """Those before a camera."""
         light = compressed(scene)
         return cls(Transfers(imaging, light, picture), light, recorded(camera, scene), hidden=hidden)
+
+    def through(self, optics: Transfers) -> Spectra:
+        """The same light through others; its spectra are shared."""
+        own = Spectra(optics, self.scene, self.weights, hidden=self.hidden, hues=self.hues)
+        own._layered = self._layered
+        return own
 
     def compare(self, settings: Mapping[str, Any], recorded: Tensor, *, cut: Tensor) -> bool:
         """Take what pixels truly record with some settings, the energy of each row (B,), for what errors are relative
@@ -213,7 +217,7 @@ class Spectra:
         much = self._recorded_bands if shares is None else self._recorded_bands @ shares.to(self._recorded_bands)
         light, spectrum = self._light, (much / much.max().clamp(min=1e-30)).clamp(min=UNSEEN)[None].to(self._light)
         grey = replace(self.scene, coefficients=light, spectra=spectrum, wavelengths=few, illuminant=spectrum[0])
-        return Spectra(self.optics, grey, None, hues=hues(self.scene, self.weights), whole=self.whole)
+        return Spectra(self.optics, grey, None, hues=hues(self.scene, self.weights))
 
     @functools.cached_property
     def _coloured(self) -> Tensor:
@@ -256,7 +260,7 @@ class Spectra:
         """Even light everywhere, in the same layers: what hides what is counted in it."""
         even = torch.ones(1, len(self.scene.wavelengths)).to(self._light)
         ones = replace(self.scene, coefficients=torch.ones_like(self._light), spectra=even, illuminant=even[0])
-        return Spectra(self.optics, ones, self.weights, whole=self.whole)
+        return Spectra(self.optics, ones, self.weights)
 
     def tabled(self, settings: Mapping[str, Any]) -> bool:
         """Whether transfer functions of all wavelengths are known at once."""
@@ -357,7 +361,7 @@ class Spectra:
         """Masks in what is recorded of each band less that of white light, where these are unlike."""
         if not self.of_lines or not self._white_masks:
             return None
-        return Spectra(self.optics, self._masks.scene, self._less_white, whole=self.whole)
+        return Spectra(self.optics, self._masks.scene, self._less_white)
 
     @property
     def _white_masks(self) -> bool:
@@ -428,7 +432,8 @@ class Spectra:
         colours = not differ(changes, against, LINEAR - COLOURS)
         factor = torch.tensor(corners, dtype=torch.float64)
         if colours:
-            factor = torch.where(self.few_lights, factor, self.optics.corners_of_colours)
+            usual = torch.tensor(self.optics.corners_of_colours, dtype=torch.float64)
+            factor = torch.where(self.few_lights, factor.maximum(usual), usual)
         factor = factor * more
         if differ(changes, against, {"interpolate_bands"}):
             of_lights = _BETWEEN_LIGHTS if self.optics.has_pixel_phase else _BETWEEN_PSFS
@@ -529,7 +534,7 @@ class Spectra:
         """
         imaging = self.imaging if layers is None else self.imaging.changed(layers=layers)
         own = imaging.accuracy.layers is not None or len(scene.wavelengths) == len(self.wavelengths)
-        if not is_deep(scene) or (own and self.whole is None):
+        if not is_deep(scene) or (own and self.optics.cut(imaging) is None):
             return imaging
         return imaging.changed(layers=tuple((1 / self._cut(scene, imaging)).tolist()))
 
@@ -537,10 +542,11 @@ class Spectra:
         """Vergences of the layers that a stage cuts a scene into, or the whole of which it is a part, in light of all
         wavelengths, (Z,).
         """
-        scene = scene if self.whole is None else self.whole
-        return imaging.vergences(
-            scene, torch.as_tensor(scene.depth, dtype=torch.float64), wavelengths=self.wavelengths
-        ).cpu()
+        found = self.optics.cut(imaging)
+        if found is None:
+            depth = torch.as_tensor(scene.depth, dtype=torch.float64)
+            found = imaging.vergences(scene, depth, wavelengths=self.wavelengths).cpu()
+        return found
 
     def _once(
         self, index: int, layered: _Layered, changes: Mapping[str, Any], against: Mapping[str, Any], way: Way

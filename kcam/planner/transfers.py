@@ -39,9 +39,9 @@ _WIDEST_STEP = 1.25e5  # of 1/wavelength, between such neighbours [1/m]: between
 # 2.5e5 apart, 0.26 of what a lens of dense flint errs was told; 12 of 28 bands from 420 to 720 nm are 1.16e5 apart
 _BESIDE = 1.7  # line spreads for each PSF, at least, between which only those of all bands lie: 0.9 to 1.15 times what
 # they are by each one's own (5 to 95 % of 36 deep scenes behind maps)
-CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
+_CUT, _CUT_ROUND = 2.0, 1.4  # times the error where a window as large as the picture cuts rays off, of a smooth pupil
 # and a round one: no slice knows its corners. Pixels scatter into all directions alike
-_CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
+CUT_COLOURS = 1.6  # the same of wavelengths, of pupils that are smooth and not round: 0.63 to 1.38 of 71 (2 %, median)
 # would be told too little without; few lights may fall into a corner
 _ASKED = (1, FEW_BANDS, ROUND)  # groups of wavelengths, beside which other choices than these are priced
 _MISSED, _DIMMER = 0.3, 0.8  # of the light, that a window holds from any distance, from which on line spreads tell
@@ -115,6 +115,12 @@ class Transfers:
         if key not in self._stages:
             self._stages[key] = self.imaging.changed(**changes)
         return self._stages[key]
+
+    def cut(self, imaging: Imaging) -> Tensor | None:
+        """Vergences of the layers that a stage cuts the whole into of which scenes are parts, (Z,) [1/m]; None where
+        they are no parts.
+        """
+        return None
 
     @functools.cached_property
     def defocus(self) -> Defocus:
@@ -275,7 +281,7 @@ class Transfers:
         query = self._widest
         if query is None or query.has_pixel_phase or self.fits:
             return 1.0
-        return _CUT_ROUND if query.symmetric else CUT
+        return _CUT_ROUND if query.symmetric else _CUT
 
     @functools.cached_property
     def passed(self) -> Tensor:
@@ -325,7 +331,7 @@ class Transfers:
     @functools.cached_property
     def corners_of_colours(self) -> float:
         """As `corners`, of choices of wavelengths alone, unless a few lights stand out."""
-        return min(self.corners, _CUT_COLOURS)
+        return min(self.corners, CUT_COLOURS)
 
     @functools.cached_property
     def left_out(self) -> float:

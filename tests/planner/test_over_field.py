@@ -88,7 +88,7 @@ def test_choices_cost_what_spectra_of_parts_tell_of_deep_scenes(seed: int) -> No
         assert len(camera[0].vergences(scene, torch.as_tensor(scene.depth))) > 1
         for name, told, true in costs(camera, scene, CHOICES | DEEP):
             assert 0.7 * true - ALLOWED <= told, name
-            assert told <= 2 * true + ALLOWED or name in DEEP, name  # what might be hidden
+            assert told <= 2.5 * true + ALLOWED or name in DEEP, name  # what might be hidden counts in
 
 
 @pytest.mark.parametrize("seed", [80, *(pytest.param(n, marks=pytest.mark.slow) for n in (81, 82, 83, 84, 90))])

@@ -106,6 +106,11 @@ class FieldPSFs:
         return self._banks.fewer
 
     @property
+    def held(self) -> int:
+        """Bytes of the PSFs that are kept."""
+        return self._banks.held
+
+    @property
     def mirrored(self) -> bool:
         """PSFs of places that mirror each other in x or y do so too."""
         return True

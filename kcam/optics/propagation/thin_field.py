@@ -49,6 +49,11 @@ class ThinFieldPSFs:
         return self._banks.fewer
 
     @property
+    def held(self) -> int:
+        """Bytes of the PSFs that are kept."""
+        return self._banks.held
+
+    @property
     def mirrored(self) -> bool:
         """Whether PSFs of places that mirror each other in x or y do so too."""
         return self._banks.mirrored
