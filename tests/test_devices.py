@@ -85,6 +85,20 @@ def test_plans_keep_their_tolerance(kind: str, seed: int, device: torch.device) 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("deep", [False, True])
+def test_plans_over_the_field(deep: bool, device: torch.device) -> None:
+    lens = optics.Lens(optics.CircularAperture(0.8e-3), optics.ThinLens(5e-3), focus_distance=2.0)
+    scene = Scene.builtin("coffee", 24)
+    scene = scene.with_depth(torch.linspace(1.9, 2.1, 24).expand(1, 1, *scene.shape[1:])) if deep else scene
+    camera = Camera(optics.Imaging(lens, pixel_pitch=6 * um, field=True), sensor.ColourFilter.kodak()).to(device)
+    scene = scene.to(device)
+    with torch.no_grad():
+        plan = camera.plan(scene, tolerance=0.05)
+        assert plan.changes
+        assert plan.measure(camera, scene) <= 0.05
+
+
+@pytest.mark.slow
 def test_a_real_lens_that_trains(device: torch.device) -> None:
     lens = optics.CompoundLens.preset("cooke_triplet", focus_distance=2.0)
     for surface in lens.surfaces:
