@@ -589,7 +589,7 @@ class Imaging(Stage):
     def _field_picture(self, scene: Scene, *, vergences: Tensor, weights: Tensor | None, like: Tensor) -> FieldPicture:
         picture, wavelengths = scene.shape[1:], scene.wavelengths
         traced = self._traced(picture, vergences, wavelengths)
-        window = self.accuracy.psf_shape or _within(traced.window(self.pixels((1, 1), like)), picture)
+        window = self.psf_window(wavelengths, vergences=vergences, picture=picture)
         psfs = self._over_field(picture, vergences, wavelengths, traced=traced)
         renderer, mixing = self._renderer(scene, (1, 1), weights=weights, like=like), None
         fewer = renderer.channels * renderer.planes < renderer.groups
